@@ -22,7 +22,7 @@ import sliplens as sl
 from sliplens.cli.console import Terminal
 from sliplens.codec import save_record
 from sliplens.intervals import Difference, mean_interval, paired_difference
-from sliplens.plots.style import UNKNOWN, input_name, inputs_in_order, method_name, tell_ends
+from sliplens.plots.style import UNKNOWN, input_name, inputs_in_order, method_name
 from sliplens.recordings import Dataset
 from sliplens.report.results import Results, load_results
 from sliplens.report.verdict import (
@@ -36,6 +36,7 @@ from sliplens.report.verdict import (
     compare_errors,
     judge_gap,
     judge_methods,
+    write_ends,
 )
 from sliplens.results.faithfulness import CHANCE, DeletionCurve
 from sliplens.results.study import QUICK_METHODS, MarkerEffects, StudyConfig
@@ -136,7 +137,7 @@ def _row(
     """Judge a claim that holds where every gap lies above zero for sure; the first is written."""
     gaps = gaps if isinstance(gaps, Sequence) else [gaps]
     first, write = gaps[0], f"{{:.{digits}f}}".format
-    ours = UNKNOWN if first is None else f"{write(first.estimate)} ({tell_ends(first, write)})"
+    ours = UNKNOWN if first is None else f"{write(first.estimate)} ({write_ends(first, write)})"
     judged = outcome or all_of(judge_gap(gap) for gap in gaps)
     return ClaimRow(
         source=source,
@@ -399,7 +400,7 @@ def _reasoning(results: Results, name: str, rng: np.random.Generator) -> Iterato
 
 
 def _estimate(gap: Difference | None) -> str:
-    return UNKNOWN if gap is None else f"{gap.estimate:.2f} ({tell_ends(gap, '{:.2f}'.format)})"
+    return UNKNOWN if gap is None else f"{gap.estimate:.2f} ({write_ends(gap, '{:.2f}'.format)})"
 
 
 def _strongest(effects: MarkerEffects) -> tuple[Float[np.ndarray, " frames"], Float[np.ndarray, " frames"]]:

@@ -20,7 +20,7 @@ from PIL import Image
 
 from sliplens.files import scratch_folder
 from sliplens.recordings import Recording, check_dataset, import_recordings
-from sliplens.report.trials import write_trials_page
+from sliplens.report.page import write_trials_page
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 _SIZE = 640, 480

@@ -15,7 +15,7 @@ from PIL import Image
 
 import sliplens as sl
 from sliplens.files import DEFAULT_NETWORK
-from sliplens.plots.margins import column
+from sliplens.plots.charts import column
 from sliplens.plots.saliency import full_colour, overlay_relevance
 from sliplens.plots.style import BLACK, BLUE, GREY, drawing_style
 from sliplens.recordings import Recording

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from sliplens.plots.contact_sheet import draw_contact_sheet
+from sliplens.plots.sheets import draw_contact_sheet
 from sliplens.plots.style import drawing_style
 from sliplens.recordings import Recording
 from sliplens.simulation import FLAT_GEL, PRESETS, SimulationRecipe, plan_trials, simulate_trial

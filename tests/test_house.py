@@ -26,15 +26,15 @@ def read(one: int, told: dict[str, Any], **more: object) -> int:
 def _read() -> dict[str, object]: ...
 '''
 ALLOWED = {
-    "lines": 40_950,
-    "modules": 169,
+    "lines": 37_420,
+    "modules": 152,
     "riddles_per_1000": 0.3,
     "vague_docstrings": 0,
     "most_parameters": 12,
-    "functions_with_on_progress": 17,
-    "functions_with_out": 22,
-    "functions_with_overwrite": 22,
-    "functions_with_device": 19,
+    "functions_with_on_progress": 15,
+    "functions_with_out": 20,
+    "functions_with_overwrite": 19,
+    "functions_with_device": 6,
     "names_defined_twice": 0,
     "dicts_across_functions": 0,
 }

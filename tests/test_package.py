@@ -35,7 +35,7 @@ def test_the_overview_of_the_commands_does_not_import_torch():
 
 def test_importing_commands_and_pages_imports_nothing_that_only_some_need():
     code = (
-        "import sys, sliplens.cli, sliplens.report, sliplens.plots.contact_sheet\n"
+        "import sys, sliplens.cli, sliplens.report\n"
         "print({'torch', 'matplotlib.pyplot', 'av', 'rerun', 'cv2'} & set(sys.modules))"
     )
     assert run_python(code).strip() == "set()"

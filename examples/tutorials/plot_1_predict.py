@@ -14,7 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import sliplens as sl
-from sliplens.plots.audit import write_audits
+from sliplens.plots.sheets import write_audits
 
 # %%
 # The recording

@@ -75,7 +75,8 @@ def run_demo(
     """
     folder = Path(out)
     real = find_real_frames(real_frames)
-    if folder.exists() and (not folder.is_dir() or _is_foreign(folder)):
+    names = [path.name for path in folder.iterdir() if path.name[0] != "."] if folder.is_dir() else []
+    if (folder.exists() and not folder.is_dir()) or (names and "data" not in names):
         raise InputError(f"{folder} exists and is no demo; choose another folder")
 
     def show(*waiting: str) -> Path:
@@ -112,11 +113,6 @@ def find_real_frames(folder: Path | str | None = None) -> Path | None:
     reference = Path(os.environ.get("SLIPLENS_REFERENCE", "../shared/reference"))
     images = reference / "chromatouch" / "difference"
     return images if images.is_dir() else None
-
-
-def _is_foreign(folder: Path) -> bool:
-    names = [path.name for path in folder.iterdir() if path.name[0] != "."]
-    return bool(names) and "data" not in names
 
 
 def _make_strip(folder: Path, data: Dataset, network: str) -> None:

@@ -17,7 +17,7 @@ STAGES = ("evaluate", "explain", "score", "faithfulness", "map-quality")
 @pytest.fixture(scope="module")
 def words(difference_run: Path, pair_run: Path, fine_dataset: Dataset) -> tuple[object, ...]:
     networks = ("--network", difference_run, pair_run)
-    quick = ("--method", "grad-cam", "occlusion", "--trials", 2, "--random-orders", 2)
+    quick = ("--method", "grad-cam", "occlusion", "--trials", 2)
     return ("study", fine_dataset.folder, *networks, *quick)
 
 

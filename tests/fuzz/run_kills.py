@@ -81,7 +81,7 @@ class Case:
 
 
 _SMALL = ("--image-size", "32", "--epochs", "2", "--batch-size", "11", "--head", "point", "--untouched-share", "0")
-_QUICK = ("--method", "grad-cam", "--trials", "1", "--random-orders", "1", "--on", "serial")
+_QUICK = ("--method", "grad-cam", "--trials", "1", "--on", "serial")
 CASES = {
     "simulate": Case((
         "simulate", "out", "--dry-trials", "3", "--wet-trials", "1", "--frames-per-trial", "20", "--days", "3",

@@ -9,14 +9,13 @@ from matplotlib.text import Text
 from there import there
 
 from sliplens.errors import InputError
-from sliplens.plots.contact_sheet import (
+from sliplens.plots.sheets import (
     brightening,
     choose_margins,
     choose_untouched,
     draw_contact_sheet,
-    enlarge,
-    write_contact_sheet,
 )
+from sliplens.plots.style import save_page
 from sliplens.recordings import ContactState
 from sliplens.results.explanation import MARGIN_LEVELS
 
@@ -88,7 +87,7 @@ def test_frames_are_shown_as_they_are_over_their_differences_times_one_factor():
         chosen = [choose_untouched(trial), *choose_margins(trial)]
         cameras, differences = ([np.asarray(next(rows)) for _ in chosen] for _ in range(2))
         for camera, difference, index in zip(cameras, differences, chosen, strict=True):
-            np.testing.assert_array_equal(camera, enlarge(trial.frames[index]))
+            np.testing.assert_array_equal(camera, trial.frames[index])
             signed = trial.frames[index].astype(float) - trial.reference
             # halves may be rounded either way
             assert np.abs(difference - np.minimum(255, factor * np.abs(signed))).max() <= 0.51
@@ -123,7 +122,7 @@ def test_one_frame_and_no_label_can_be_drawn(tmp_path):
         **{name: getattr(trial, name)[:1] for name in signals},
     )
 
-    write_contact_sheet([one], tmp_path / "new" / "preview.svg")
+    save_page(draw_contact_sheet([one]), tmp_path / "new" / "preview.svg")
 
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["preview.svg"]
     assert sum(text == "no frame" for text in texts(draw_contact_sheet([one]))) == len(MARGIN_LEVELS)

@@ -1,22 +1,16 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
-from made_up import made_up_evaluation, write_workspace
+from made_up import write_workspace
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from PIL import Image
 
-from sliplens.plots.errors import (
-    draw_evaluation,
+from sliplens.plots.charts import (
     plot_bins,
     plot_faithfulness,
     plot_learning_curves,
     plot_predictions,
 )
-from sliplens.plots.style import ORANGE
 from sliplens.report import Results, load_results
-from sliplens.results.evaluation import Evaluation, ScoredFrames
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +32,7 @@ def draw(name: str, results: Results, ax: Axes) -> Axes:
     evaluations, scored = results.evaluations, results.deletion["difference"]
     return {
         "bins": lambda: plot_bins({key: one.conditions["dry"].bins for key, one in evaluations.items()}, ax=ax),
-        "predictions": lambda: plot_predictions(evaluations["raw"].predictions, colour=ORANGE, ax=ax),
+        "predictions": lambda: plot_predictions(evaluations["raw"].predictions, ax=ax),
         "learning": lambda: plot_learning_curves(results.trainings, ax=ax),
         "faithfulness": lambda: plot_faithfulness(scored.curves, ax=ax),
     }[name]()
@@ -48,7 +42,7 @@ def draw(name: str, results: Results, ax: Axes) -> Axes:
     ("name", "labels", "entries"),
     [
         ("bins", ("Safety margin Γ (%)", "MSE (Γ as a fraction, squared)"), ["Raw", "Difference"]),
-        ("predictions", ("True Γ (%)", "Predicted Γ (%)"), ["perfect", "one frame"]),
+        ("predictions", ("True Γ (%)", "Predicted Γ (%)"), ["perfect", "dry", "wet"]),
         (
             "learning",
             ("Epoch (passes over the training frames)", "MSE (Γ as a fraction, squared)"),
@@ -93,38 +87,3 @@ def test_predictions_outside_the_range_are_shown(results, ax):
     low, high = ax.get_ylim()
     assert low < predictions.min()
     assert high > predictions.max()
-
-
-def evaluation(*, sure: bool = True) -> Evaluation:
-    """Two dry trials that are read well, and a wet one that is read too high."""
-    rng = np.random.default_rng(0)
-    time = np.arange(60) / 8
-    labels = np.clip(1.1 - time / 6.5, 0, 1)
-    bias = np.repeat([0.0, 0.03, 0.2], 60)
-    condition = np.repeat(["dry", "dry", "wet"], 60)
-    answers = np.tile(labels, 3) + bias + rng.normal(0, 0.04, 180)
-    sigma = np.where(condition == "wet", 0.12, 0.05) * rng.uniform(0.7, 1.3, 180) if sure else np.full(180, np.nan)
-    predictions = ScoredFrames(
-        trial=np.repeat(["a", "b", "c_$1"], 60),
-        condition=condition,
-        day=np.zeros(180, dtype=np.int64),
-        frame=np.tile(np.arange(60), 3),
-        time_s=np.tile(time, 3),
-        safety_margin=np.tile(labels, 3),
-        prediction=answers,
-        sigma=sigma,
-        low_90=np.clip(answers - 1.6 * sigma, 0, 1),
-        high_90=np.clip(answers + 1.6 * sigma, 0, 1),
-        withheld=np.full(180, ""),
-    )
-    return made_up_evaluation(predictions, sure=sure)
-
-
-@pytest.mark.parametrize("sure", [True, False])
-def test_the_picture_of_an_evaluation_is_drawn_with_and_without_uncertainty(tmp_path: Path, sure: bool):
-    draw_evaluation(evaluation(sure=sure), tmp_path / "page.png", title="train-difference, test trials")
-    with Image.open(tmp_path / "page.png") as image:
-        pixels = np.array(image.convert("L"))
-    # 12 inches at 150 dots, and something is drawn in every third of it
-    assert pixels.shape[1] == 1800
-    assert all(part.std() > 10 for part in np.array_split(pixels, 3, axis=1))

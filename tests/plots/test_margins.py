@@ -10,7 +10,7 @@ from matplotlib.collections import FillBetweenPolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from sliplens.plots.margins import draw_strip, plot_margins
+from sliplens.plots.charts import draw_strip, plot_margins
 from sliplens.results.explanation import Strip, StripReadings
 
 TIME_S = np.arange(6) / 10

@@ -82,7 +82,7 @@ def test_a_panel_of_many_frames_shows_a_few_from_the_first_to_the_last(tmp_path:
     monkeypatch.setattr("sliplens.plots.saliency.Figure.savefig", lambda figure, *_, **__: figures.append(figure))
     draw_explanation(of_relevance(np.zeros((40, 8, 8), dtype=np.float32)), tmp_path)
     [figure] = figures
-    heads = [text.get_text().partition("\n")[0] for text in figure.texts]
+    heads = [ax.get_title().partition("\n")[0] for ax in figure.axes]
     columns = [int(head) for head in heads if head.isdigit()]
     assert (columns[0], columns[-1], len(columns)) == (0, 39, 12)
     assert set(np.diff(columns)) == {3, 4}  # 39 steps over 11 gaps

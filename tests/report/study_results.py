@@ -59,7 +59,6 @@ class Made:
     spread: float = 0.01
     """Of the gains over trials."""
     looks: Mapping[str, Mapping[str, float]] = field(default_factory=lambda: MAP_MEASURES)
-    rougher_told: bool = True
     top_share: float = 0.8
     """Of the network's effects that two markers hold."""
     edge_mass: float = 0.3
@@ -105,7 +104,7 @@ def write_study(workspace: Path, made: Made | None = None, *, seed: int = 7) -> 
         write_maps(workspace, name, made, rng=rng)
         write_thesis_scores(workspace, name, made, rng=rng)
         write_faithfulness(workspace, name, made, rng=rng)
-        write_others(workspace, name, made)
+        write_quality(workspace, name, made)
         write_truth(workspace, name, made, rng=rng)
     return workspace
 
@@ -225,48 +224,14 @@ def write_faithfulness(workspace: Path, name: str, made: Made, *, rng: np.random
     return write_run(workspace / f"faithfulness-{name}", "faithfulness", {}, scores)
 
 
-def write_others(workspace: Path, name: str, made: Made) -> None:
-    layers = (1, 4, 8, 16)
-    randomised = {
-        method: MapMeasures(
-            layers=layers,
-            similarity=tuple(
-                0.9 / (1 + index * (0.1 if method == "grad-cam" else 1.0)) for index in range(len(layers))
-            ),
-        )
-        for method in METHODS
-    }
-    write_run(
-        workspace / f"randomisation-{name}",
-        "randomisation",
-        {},
-        MapQuality(input=name, source="simulated", frames=6, methods=randomised),
-    )
-    rougher = [
-        MethodGap(first=first, second=second, gap=interval(gap, made.trials, half=0.001))
-        for first, second in combinations(made.looks, 2)
-        for gap in [made.looks[first]["total_variation"] - made.looks[second]["total_variation"]]
-    ]
-    write_quality(workspace, name, made.looks, rougher if made.rougher_told else [])
-    seconds = {"grad-cam": 0.02, "integrated-gradients": 0.4, "poly-cam": 3.0}
-    timed = {method: MapMeasures(seconds=value) for method, value in seconds.items()}
-    timing = MapQuality(input=name, source="simulated", frames=3, methods=timed)
-    write_run(workspace / f"timing-{name}", "timing", {}, timing)
-
-
-def write_quality(
-    workspace: Path, name: str, looks: Mapping[str, Mapping[str, float]], rougher: Sequence[MethodGap] = ()
-) -> Path:
-    quality = MapQuality(
-        input=name,
-        source="simulated",
-        frames=42,
-        methods={
-            method: MapMeasures(resolution=values["resolution"], total_variation=values["total_variation"])
-            for method, values in looks.items()
-        },
-        comparisons=tuple(rougher),
-    )
+def write_quality(workspace: Path, name: str, made: Made) -> Path:
+    looks = {method: MapMeasures(**values) for method, values in made.looks.items()}
+    rougher = []
+    for first, second in combinations(made.looks, 2):
+        gap = made.looks[first]["total_variation"] - made.looks[second]["total_variation"]
+        rougher.append(MethodGap(first=first, second=second, gap=interval(gap, made.trials, half=0.001)))
+    facts = {"input": name, "source": "simulated", "frames": 42}
+    quality = MapQuality(**facts, methods=looks, comparisons=tuple(rougher))
     return write_run(workspace / f"map-quality-{name}", "map-quality", {}, quality)
 
 
@@ -277,7 +242,6 @@ def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Genera
     for row in rows:
         network = np.full(len(x), (1 - made.top_share) / (len(x) - 2))
         network[[14, 20]] = made.top_share / 2
-        margin = 0.05 * np.exp(-((x - size / 2) ** 2 + (y - 0.6 * size) ** 2) / (0.1 * size**2))
         # a little of its own in each trial, so that an interval has a width
         network = 0.3 * network * (1 + 0.02 * rng.random(len(x)))
         tables.append(
@@ -292,19 +256,12 @@ def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Genera
                 shapley=network,
                 shapley_error=0.1 * network,
                 stick=network,
-                network=network,
-                margin=-margin,
                 state=np.ones(len(x), dtype=np.int64),
             )
         )
     known = {"edges": 0.1, "oracle": 1.0, "degraded-oracle": 0.8}
     spearman = {**made.spearman, **known}
-    held = {
-        "oracle": 0.3,
-        "degraded": 0.2,
-        "changed": 0.1,
-        "gap": interval(0.1, made.trials),
-    }
+    test = MetaTest(fill="true", oracle=0.3, degraded=0.2, changed=0.1, gap=interval(0.1, made.trials))
     return write_run(
         workspace / f"truth-{name}",
         "truth",
@@ -318,24 +275,17 @@ def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Genera
                     neutral=interval(value, made.trials),
                     stick=interval(value, made.trials),
                     shapley=interval(value, made.trials),
-                    network=interval(value, made.trials),
-                    margin=interval(value / 2, made.trials),
                     lead_over_controls=None
                     if method in known
                     else Lead(control="edges", gap=interval(value - known["edges"], made.trials)),
-                    lead_over_methods={
-                        other: interval(value - less, made.trials)
-                        for other, less in (() if method in known else made.spearman.items())
-                        if other != method
-                    },
+                    lead_over_methods={},
                     edges=interval(made.edge_mass - 0.07, made.trials, half=0.01),
                 )
                 for method, value in spearman.items()
             },
             neutral_reliability=0.9,
             pairs=400,
-            reliability=interval(0.9, made.trials),
-            meta=(MetaTest(fill="true", **held),),
+            meta=(test,),
             effects=MarkerEffects.joined(tables),
             neutral=NeutralScores(
                 frame_id=np.tile([row.id for row in rows], len(spearman)),

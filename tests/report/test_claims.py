@@ -222,7 +222,7 @@ def test_frames_that_are_left_out_of_the_scores_are_named(made):
     fewer = replace(results, truth=results.truth | {"raw": replace(truth, frames=truth.frames - 2)})
     assert list(fewer.left_out) == ["raw"]
     sections = {section.id: section for section in build_sections(fewer)}
-    assert f"2 of {truth.frames} frames to score are left out with the raw network" in str(sections["choice"].blocks[0])
+    assert f"2 of {truth.frames} frames to score are left out with the raw network" in str(sections["choice"].blocks[1])
 
 
 @pytest.mark.parametrize("sound", [False, True])

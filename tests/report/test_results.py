@@ -5,14 +5,13 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from sliplens.errors import InputError
 from sliplens.report import load_results
 
-from .study_results import FILLS, METHODS
+from .study_results import FILLS
 
 
 def change(path: Path, **fields):
@@ -128,15 +127,3 @@ def test_markers_keep_their_places(study):
         # one marker was not followed
         assert np.isnan(frame.now_px[0]).all()
         assert np.isfinite(frame.now_px[1:]).all()
-
-
-def test_methods_unknown_to_the_report_are_kept(study):
-    path = study / "faithfulness-raw" / "table.parquet"
-    table = pq.read_table(path)
-    own = table.filter(pa.array([name == "poly-cam" for name in table["method"].to_pylist()]))
-    named = own.set_column(own.column_names.index("method"), "method", pa.array(["my-cam"] * own.num_rows))
-    pq.write_table(pa.concat_tables([table, named]), path)
-
-    curves = load_results(study).faithfulness["raw"].curves
-
-    assert {method for _, _, method in curves} >= {*METHODS, "my-cam"}

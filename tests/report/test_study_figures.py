@@ -12,7 +12,7 @@ import sliplens as sl
 from sliplens.codec import Result
 from sliplens.report import Results, load_results
 from sliplens.report.plates import Plate, bright_pictures, write_plates
-from sliplens.report.tables import table_scores
+from sliplens.report.sections import table_scores
 from sliplens.results.evaluation import Evaluation, Training
 from sliplens.results.explanation import Strip, StripReadings
 from sliplens.results.study import RECORDS, UntrainedMaps
@@ -91,7 +91,7 @@ def test_numbers_are_written_with_nine_digits_and_files_are_the_same_each_time(t
         assert list(csv.reader(stream)) == [["name", "value"], ["a", "0.333333333"], ["b", "2"]]
     assert page.name == "line.pdf"
     assert page.read_bytes() == again.read_bytes()
-    assert make_plate().picture == make_plate().picture
+    assert make_plate().uri == make_plate().uri
 
 
 @pytest.mark.parametrize(("more", "beside"), [((), "Poly-CAM"), (("poly-cam-thesis",), "Poly-CAM as in the thesis")])

@@ -24,7 +24,7 @@ from sliplens.simulation.intervention import (
     put_markers_back,
     rebuild_trial,
 )
-from sliplens.simulation.loading import load_at_margins, move_markers
+from sliplens.simulation.loading import load_at_margins
 from sliplens.simulation.nuisances import Day, Grasp
 from sliplens.simulation.plan import read_recipe
 
@@ -92,19 +92,6 @@ def test_all_markers_back_and_no_touch_is_the_untouched_sensor(sensor):
     np.testing.assert_array_equal(untouched, film.draw_reference().numpy())
     # the touch alone, its veil and sharper focus, is what is left of a frame whose markers are all put back
     assert np.any(changed.draw(slice(0, 1)).numpy()[0] != untouched)
-
-
-def test_a_frames_touch_moves_its_markers_as_the_trial_did(trials):
-    for trial in trials:
-        margins = trial.loading.safety_margin
-        # before the first slip, which the touch does not tell of
-        for frame in np.flatnonzero(margins > 0)[::5].tolist():
-            if trial.loading.carried_friction[frame] > 0:
-                continue
-            touch = trial.touch(frame)
-            loading = load_at_margins(margins[frame : frame + 1], grasp=touch.grasp)
-            motion = move_markers(trial.film.sensor, touch, loading=loading)
-            np.testing.assert_allclose(motion.centres_px[0], trial.film.motion.centres_px[frame], atol=1e-9)
 
 
 def test_outlines_are_the_drawn_circles(trials):

@@ -405,13 +405,12 @@ def call_evaluate(call: Any, *, device: str = "cpu") -> None:
         Device of the network: cpu, cuda or cuda:1.
     """
     from sliplens.models.checkpoint import load
-    from sliplens.plots.errors import draw_evaluation
+    from sliplens.plots.figure import plot
+    from sliplens.plots.style import save_page
 
-    run = call.keywords["run"]
-    evaluation = call(run=load(run, device=device))
+    evaluation = call(run=load(call.keywords["run"], device=device))
     if (out := call.keywords.get("out")) is not None and not (picture := Path(out) / "evaluation.png").is_file():
-        title = f"{Path(run).name}, {evaluation.split} trials of {Path(call.keywords['data']).name}"
-        draw_evaluation(evaluation, picture, title=title)
+        save_page(plot(evaluation), picture)
     output.print_scores(evaluation)
 
 
@@ -442,7 +441,7 @@ def call_predict(call: Any, *, plot: Path | None = None) -> None:
     if "friction" in call.keywords:
         say(f"margins for the given friction of {call.keywords['friction']}")
     if plot is not None:
-        from sliplens.plots.margins import draw_margins
+        from sliplens.plots.charts import draw_margins
 
         names = [call.keywords[name] for name in ("source", "run") if name in call.keywords]
         title = ", predicted by ".join(Path(name).name for name in names)
@@ -508,10 +507,14 @@ command("status", "runner:read_status", "sliplens status runs/mine/margins")(
     ("settings", "--set"),
 )
 def call_grip(call: Any) -> None:
-    """Print what became of the episodes, and draw the page."""
+    """Print what became of the episodes, and draw the first."""
+    from sliplens.plots.figure import plot
+    from sliplens.plots.style import save_page
+
     out = require_out(call, "folder to make")
-    output.print_grip(call(out=out / "grip"))
-    output.draw_report(out)
+    grip = call(out=out / "grip")
+    save_page(plot(grip), out / "grip.png")
+    output.print_grip(grip)
 
 
 class HoldOptions(TypedDict, total=False):

@@ -84,9 +84,10 @@ def _interval(low: float | None, high: float | None) -> str:
     return "-" if low is None or high is None else f"{100 * low:.0f} to {100 * high:.0f} %"
 
 
-def draw_simulation(path: Path, *, preset: str = "small", **changes: "Unpack[RecipeChanges]") -> None:
+def draw_simulation(preview: Path, *, preset: str = "small", **changes: "Unpack[RecipeChanges]") -> None:
     """Draw the contact sheet of a simulated data set."""
-    from sliplens.plots.contact_sheet import write_contact_sheet
+    from sliplens.plots.sheets import draw_contact_sheet
+    from sliplens.plots.style import save_page
     from sliplens.simulation import make_recipe, simulate_examples
 
     recipe = make_recipe(preset, **changes)
@@ -94,13 +95,13 @@ def draw_simulation(path: Path, *, preset: str = "small", **changes: "Unpack[Rec
         with open_stage("Simulating trials for the preview"):
             recordings = simulate_examples(recipe)
         title = f"Simulated {recipe.sensor.name}, {recipe.resolved_displacement} displacement, seed {recipe.seed}"
-        write_contact_sheet(recordings, path, title=title)
-        report_file(path, f"{len(recordings)} of the trials that this recipe makes")
+        save_page(draw_contact_sheet(recordings, title=title), preview)
+        report_file(preview, f"{len(recordings)} of the trials that this recipe makes")
 
 
 def draw_audits(data: "Dataset", folder: Path) -> None:
     """Draw the audit pages that are missing."""
-    from sliplens.plots.audit import write_audits
+    from sliplens.plots.sheets import write_audits
 
     if write_audits(data, folder, on_progress=Terminal()):
         print_file(folder, "a page for each trial: look at them before you train")
@@ -108,7 +109,7 @@ def draw_audits(data: "Dataset", folder: Path) -> None:
 
 def show_labelled(title: str, data: "Dataset", *, audit: bool) -> None:
     """Draw the pages of a labelled data set, and print what its labels rest on."""
-    from sliplens.report.trials import write_trials_page
+    from sliplens.report.page import write_trials_page
 
     if audit:
         draw_audits(data, data.folder / "audit")
@@ -283,9 +284,12 @@ def print_status(path: Path, works: "Sequence[Status]") -> None:
 
 def print_grip(result: "Grip") -> None:
     """Print what became of the episodes."""
-    table = result.episodes
+    from scipy.stats import binomtest
+
+    table, fell = result.episodes, int(result.episodes.dropped.sum())
+    low, high = binomtest(fell, len(table)).proportion_ci(method="wilson")
     rows = [
-        ("dropped", f"{int(table.dropped.sum())} of {len(table)}"),
+        ("dropped", f"{fell} of {len(table)} ({100 * low:.0f} to {100 * high:.0f} %, 95 % interval)"),
         ("crushed", f"{int(table.crushed.sum())}"),
         ("slip, median", f"{1e3 * float(sorted(table.slip_m)[len(table) // 2]):.1f} mm"),
         ("mean force", f"{table.mean_force_n.mean():.2f} N"),

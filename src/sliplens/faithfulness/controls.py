@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from sliplens.errors import InputError, ModelError
-from sliplens.explainers.attribution import change_of, combine, frame_of, local_change, pearson_r, with_reference_of
+from sliplens.explainers.attribution import change_of, combine, frame_of, local_change, with_reference_of
 from sliplens.explainers.cam import capture, find_layers
 from sliplens.intervals import paired_difference
 from sliplens.results.explanation import require_saliency
@@ -52,14 +52,6 @@ def resolution(saliency: Float[np.ndarray, "height width"], markers_px: Float[np
         if min(peaks) > 0:
             depths.append(1 - float(values[third:-third].min()) / float(min(peaks)))
     return float(np.clip(np.mean(depths), 0, 1)) if depths else float("nan")
-
-
-def stability(
-    maps: Float[np.ndarray, "images height width"], others: Float[np.ndarray, "images height width"]
-) -> Float[np.ndarray, " images"]:
-    """Pearson's correlation of each map with its like, such as the next frame's; NaN where a map is constant."""
-    pairs = zip(torch.tensor(maps), torch.tensor(others), strict=True)
-    return np.array([pearson_r(map_, other) for map_, other in pairs])
 
 
 def infidelity(

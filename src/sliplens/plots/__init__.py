@@ -1,1 +1,1 @@
-"""Figures and clips of records, drawn without torch."""
+"""Figures of records, drawn without torch."""

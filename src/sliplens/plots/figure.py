@@ -19,29 +19,14 @@ from sliplens.errors import InputError
 from sliplens.files import DEFAULT_NETWORK, require_new_file, whole_file
 from sliplens.intervals import Difference
 from sliplens.markers.gel import SensorProposal, propose_profile
-from sliplens.plots.contact_sheet import plot_margin
-from sliplens.plots.errors import plot_faithfulness, plot_learning_curves, plot_predictions, plot_removal
-from sliplens.plots.margins import column, plot_grip_force, plot_hold, plot_margins, plot_readings
+from sliplens.plots import charts, style
 from sliplens.plots.saliency import POINTS, SIGN_COLOURS, full_points, overlay_points
-from sliplens.plots.style import (
-    BLACK,
-    BLUE,
-    GREY,
-    VERMILLION,
-    amount,
-    drawing_style,
-    fill_name,
-    input_name,
-    method_colour,
-    method_name,
-    methods_in_order,
-    written_whole,
-)
+from sliplens.plots.sheets import plot_margin
 from sliplens.recordings.sensor import profile_text
 from sliplens.recordings.source import Frames
 from sliplens.results.explanation import CLOSE, Explanation
 from sliplens.results.faithfulness import Faithfulness, is_control
-from sliplens.results.study import MapQuality, Study, Truth, UntrainedMaps
+from sliplens.results.study import Study, Truth, UntrainedMaps
 
 
 def plot(result: Any, ax: Axes | None = None, *, index: int | None = None) -> Figure:
@@ -94,7 +79,7 @@ def plot(result: Any, ax: Axes | None = None, *, index: int | None = None) -> Fi
     drawer = drawer or (_rows if isinstance(result, Result | Columns) else None)
     if drawer is None:
         raise InputError(f"there is no picture of a {type(result).__name__}; there is one of {', '.join(DRAWERS)}")
-    with drawing_style():
+    with style.drawing_style():
         figure = Figure(figsize=(6.4, 4.2), layout="constrained") if ax is None else ax.get_figure(root=True)
         assert figure is not None
         drawer(result, figure.subplots() if ax is None else ax, index)
@@ -117,14 +102,16 @@ def _explanation(explanation: Explanation, ax: Axes, index: int | None) -> None:
     bar = figure.colorbar(ScalarMappable(Normalize(-full, full), SIGN_COLOURS), ax=ax, shrink=0.9)
     bar.set_label(f"orange lowers the prediction, blue raises it\n({unit})", fontsize=8)
     bar.ax.tick_params(labelsize=8)
-    predicted = "withheld" if frame.withheld else amount(frame.prediction, explanation.unit)
-    compared, close = amount(frame.reference_prediction, explanation.unit), CLOSE * explanation.scale
+    predicted = "withheld" if frame.withheld else style.amount(frame.prediction, explanation.unit)
+    compared, close = style.amount(frame.reference_prediction, explanation.unit), CLOSE * explanation.scale
     why = f"{frame.id}: why {predicted} rather than {compared}, that of {baseline}"
     if abs(changes[row]) <= close:
-        near = amount(close, explanation.unit)
+        near = style.amount(close, explanation.unit)
         why = f"{frame.id}: nothing to explain, for {predicted} is within {near} of that of {baseline}"
-    ax.set_title(f"{method_name(method)}\n{wrap(why, 46)}", fontsize=9, parse_math=False)
-    ax.set_xlabel(wrap("; ".join(explanation.methods[method].warnings), 62), fontsize=7.5, loc="left", color=VERMILLION)
+    ax.set_title(f"{style.method_name(method)}\n{wrap(why, 46)}", fontsize=9, parse_math=False)
+    ax.set_xlabel(
+        wrap("; ".join(explanation.methods[method].warnings), 62), fontsize=7.5, loc="left", color=style.VERMILLION
+    )
 
 
 def _faithfulness(faithfulness: Faithfulness, ax: Axes, _: int | None) -> None:
@@ -134,33 +121,21 @@ def _faithfulness(faithfulness: Faithfulness, ax: Axes, _: int | None) -> None:
     gains = {score.method: score.srg for score in faithfulness.scores if (score.fill, score.unit) == (fill, unit)}
     methods = [name for name in gains if not is_control(name)]
     if len(methods) == 1:
-        plot_removal(faithfulness.curves[fill, unit, methods[0]], colour=BLUE, ax=ax)
+        charts.plot_removal(faithfulness.curves[fill, unit, methods[0]], colour=style.BLUE, ax=ax)
         ax.set(xlabel="Removed (% of the image)", ylabel=f"Evidence lost ({faithfulness.unit_words})", xlim=(0, 100))
-        ax.set_title(f"{method_name(methods[0])} ({fill_name(fill, unit)})")
+        ax.set_title(f"{style.method_name(methods[0])} ({style.fill_name(fill, unit)})")
         ax.legend()
         return
     _plot_methods(gains, ax)
-    ax.set(xlabel=f"Symmetric gain, {fill_name(fill, unit)} ({faithfulness.unit_words}, 95 % interval)")
-    ax.set_title(input_name(faithfulness.input))
+    ax.set(xlabel=f"Symmetric gain, {style.fill_name(fill, unit)} ({faithfulness.unit_words}, 95 % interval)")
+    ax.set_title(style.input_name(faithfulness.input))
 
 
 def _truth(truth: Truth, ax: Axes, _: int | None) -> None:
     scores = {name: method.neutral for name, method in truth.methods.items() if method.neutral is not None}
     _plot_methods(scores, ax)
     ax.set(xlabel="Correlation with the effects of moved groups of markers (95 % interval)")
-    ax.set_title(input_name(truth.input))
-
-
-def _quality(record: MapQuality, ax: Axes, index: int | None) -> None:
-    if not all(method.similarity for method in record.methods.values()):
-        _rows(record, ax, index)
-        return
-    for name in methods_in_order(record.methods):
-        method = record.methods[name]
-        values = np.array(method.similarity, dtype=float)
-        ax.plot(method.layers, values, marker="o", color=method_colour(name), label=method_name(name))
-    ax.set(xlabel="Layers with new weights", ylabel="Similarity to the map of the network", ylim=(-1.05, 1.05))
-    ax.legend(fontsize=8)
+    ax.set_title(style.input_name(truth.input))
 
 
 def _untrained(record: UntrainedMaps, ax: Axes, index: int | None) -> None:
@@ -168,7 +143,7 @@ def _untrained(record: UntrainedMaps, ax: Axes, index: int | None) -> None:
     figure = ax.get_figure(root=True)
     assert figure is not None
     figure.colorbar(ax.imshow(maps[index or 0], cmap="gray"), ax=ax, label="relevance in the output's unit")
-    ax.set_title(method_name(name))
+    ax.set_title(style.method_name(name))
 
 
 def _rows(result: Any, ax: Axes, _: int | None) -> None:
@@ -179,27 +154,29 @@ def _rows(result: Any, ax: Axes, _: int | None) -> None:
     if not (len(table) and numbers):
         raise InputError(f"this {type(result).__name__} holds no number to draw")
     name = next((name for name in numbers if name == "frames" or pa.types.is_floating(kinds[name])), numbers[0])
-    values, words = column(table, name), name.replace("_", " ")
+    values, words = charts.column(table, name), name.replace("_", " ")
     texts = [table[each].to_pylist() for each, kind in kinds.items() if COLUMN_KINDS["texts"](kind)]
     if len(table) > _MOST_BARS or not texts:
-        ax.plot(values, color=BLUE)
+        ax.plot(values, color=style.BLUE)
         ax.set(xlabel="Row", ylabel=words)
         return
-    ax.barh([f"{number}  {method_name(texts[0][number])}" for number in range(len(table))], values, color=BLUE)
+    ax.barh(
+        [f"{number}  {style.method_name(texts[0][number])}" for number in range(len(table))], values, color=style.BLUE
+    )
     ax.invert_yaxis()
     ax.set(xlabel=words)
 
 
 def _plot_methods(values: Mapping[str, Difference], ax: Axes) -> None:
     """Draw the value of each method with its interval, the first on top, controls in grey."""
-    names = methods_in_order(values)
+    names = style.methods_in_order(values)
     for place, name in enumerate(names):
-        value, colour = values[name], GREY if is_control(name) else BLUE
+        value, colour = values[name], style.GREY if is_control(name) else style.BLUE
         if value.low is not None and value.high is not None:
             ax.plot([value.low, value.high], [place, place], color=colour)
         ax.plot([value.estimate], [place], color=colour, marker="o")
-    ax.axvline(0, color=BLACK, linewidth=0.8, linestyle=":")
-    ax.set_yticks(range(len(names)), [method_name(name) for name in names])
+    ax.axvline(0, color=style.BLACK, linewidth=0.8, linestyle=":")
+    ax.set_yticks(range(len(names)), [style.method_name(name) for name in names])
     ax.invert_yaxis()
 
 
@@ -211,12 +188,12 @@ def _study(study: Study, ax: Axes, index: int | None) -> None:
 
 def _tracking(tracking: Any, ax: Axes, index: int | None) -> None:
     rows = _rows_of_trial(tracking.to_arrow(), index)
-    frame, right, down = (column(rows, name) for name in ("frame", "dx_px", "dy_px"))
+    frame, right, down = (charts.column(rows, name) for name in ("frame", "dx_px", "dy_px"))
     frames, length = np.unique(frame), np.hypot(right, down)
     lengths = [length[(frame == number) & np.isfinite(length)] for number in frames]
     for values, name, colour in (
-        ([np.median(moved) if len(moved) else np.nan for moved in lengths], "median marker", BLUE),
-        ([moved.max() if len(moved) else np.nan for moved in lengths], "marker that moved most", VERMILLION),
+        ([np.median(moved) if len(moved) else np.nan for moved in lengths], "median marker", style.BLUE),
+        ([moved.max() if len(moved) else np.nan for moved in lengths], "marker that moved most", style.VERMILLION),
     ):
         ax.plot(frames, values, color=colour, label=name)
     ax.set(xlabel="Frame", ylabel="Displacement (px)")
@@ -240,28 +217,27 @@ def _of(count: int, index: int) -> int:
 def _network(network: Any, ax: Axes, _: int | None) -> None:
     if network.training is None:
         raise InputError("this network has no record of its training, whose learning curve would be drawn")
-    plot_learning_curves({network.training.input: network.training}, ax=ax)
+    charts.plot_learning_curves({network.training.input: network.training}, ax=ax)
 
 
 _MOST_BARS = 40
 DRAWERS: dict[str, Callable[[Any, Axes, int | None], object]] = {
-    "Evaluation": lambda result, ax, _: plot_predictions(result.predictions, ax=ax),
-    "Training": lambda result, ax, _: plot_learning_curves({result.input: result}, ax=ax),
+    "Evaluation": lambda result, ax, _: charts.plot_predictions(result.predictions, ax=ax),
+    "Training": lambda result, ax, _: charts.plot_learning_curves({result.input: result}, ax=ax),
     "Network": _network,
     "Explanation": _explanation,
     "UntrainedMaps": _untrained,
-    "MapQuality": _quality,
-    "DeletionScores": lambda result, ax, _: plot_faithfulness(result.curves, ax=ax).set_title(input_name(result.input)),
+    "DeletionScores": lambda of, ax, _: charts.plot_faithfulness(of.curves, ax=ax).set_title(f"{of.input} images"),
     "Faithfulness": _faithfulness,
     "Study": _study,
     "Truth": _truth,
-    "Predictions": lambda result, ax, index: plot_margins(_rows_of_trial(result.to_arrow(), index), ax=ax),
-    "ScoredFrames": lambda result, ax, index: plot_margins(_rows_of_trial(result.to_arrow(), index), ax=ax),
+    "Predictions": lambda result, ax, index: charts.plot_margins(_rows_of_trial(result.to_arrow(), index), ax=ax),
+    "ScoredFrames": lambda result, ax, index: charts.plot_margins(_rows_of_trial(result.to_arrow(), index), ax=ax),
     "Tracking": _tracking,
-    "Grip": lambda result, ax, _: plot_grip_force(result.trace.to_arrow(), ax=ax).set_title(result.setup.controller),
-    "Hold": lambda result, ax, _: plot_hold(result.steps.to_arrow(), ax=ax).set_title(result.controller),
+    "Grip": lambda of, ax, _: charts.plot_grip_force(of.trace.to_arrow(), ax=ax).set_title(of.setup.controller),
+    "Hold": lambda result, ax, _: charts.plot_hold(result.steps.to_arrow(), ax=ax).set_title(result.controller),
     "Recording": lambda result, ax, _: plot_margin(result, ax=ax).set_title(result.trial, parse_math=False),
-    "Strip": lambda result, ax, _: plot_readings(result, ax=ax),
+    "Strip": lambda result, ax, _: charts.plot_readings(result, ax=ax),
 }
 """Functions that draw a record, by the name of its class."""
 
@@ -269,12 +245,12 @@ DRAWERS: dict[str, Callable[[Any, Axes, int | None], object]] = {
 def write_proposal(proposal: SensorProposal, path: Path) -> None:
     """Save the camera's frame with gel, crop and markers beside the frame that the profile makes of it, as PNG."""
     profile, frame, markers = proposal.profile, proposal.picture, proposal.markers_px
-    with drawing_style(), written_whole(path) as part:
+    with style.drawing_style(), style.written_whole(path) as part:
         figure = Figure(figsize=(9.6, 4.6), layout="constrained")
         camera, made = figure.subplots(1, 2, width_ratios=(frame.shape[1] / frame.shape[0], 1.0))
         camera.imshow(frame)
         crop = profile.crop_px or (0, 0, frame.shape[1], frame.shape[0])
-        for (x, y, *size), colour, words in ((proposal.gel_px, BLUE, "gel"), (crop, VERMILLION, "crop_px")):
+        for (x, y, *size), colour, words in ((proposal.gel_px, style.BLUE, "gel"), (crop, style.VERMILLION, "crop_px")):
             box = {"fill": False, "color": colour, "linewidth": 1.6, "label": words}
             camera.add_patch(Rectangle((x - 0.5, y - 0.5), *size, **box))
         if len(markers):

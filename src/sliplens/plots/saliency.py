@@ -13,16 +13,14 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 
 from sliplens.images import write_png
-from sliplens.plots.style import ORANGE, SKY, drawing_style, method_name, percent, place_axes, place_text, reading_words
+from sliplens.plots.style import ORANGE, SKY, drawing_style, method_name, percent, reading_words
 from sliplens.results.explanation import BASELINES, Explanation, full_colour
 
 FrameU8: TypeAlias = UInt8[np.ndarray, "height width 3"]
 """A picture, RGB."""
 DIM = 0.55  # of the picture's lightness: leaves the bright end of the colours to the relevance
-LOWERS, RAISES = ORANGE, SKY
-"""Colours of what lowers an answer and of what raises it: bright on dark, and told apart by everyone."""
-SIGN_COLOURS = LinearSegmentedColormap.from_list("sign", [LOWERS, (DIM / 2,) * 3, RAISES])
-"""Both over a mid-grey picture, from -1 to 1."""
+SIGN_COLOURS = LinearSegmentedColormap.from_list("sign", [ORANGE, (DIM / 2,) * 3, SKY])
+"""Colours of what lowers a prediction and of what raises it over a mid-grey picture, from -1 to 1."""
 
 
 def overlay_relevance(picture: FrameU8, share: Float[np.ndarray, "rows columns"]) -> FrameU8:
@@ -32,7 +30,7 @@ def overlay_relevance(picture: FrameU8, share: Float[np.ndarray, "rows columns"]
     """
     places = [np.arange(side) * count // side for side, count in zip(picture.shape, share.shape, strict=False)]
     value = np.clip(share[np.ix_(*places)].astype(np.float64), -1, 1)[..., None]
-    colour = np.where(value < 0, to_rgb(LOWERS), to_rgb(RAISES))
+    colour = np.where(value < 0, to_rgb(ORANGE), to_rgb(SKY))
     lightness = picture @ np.array([0.299, 0.587, 0.114]) / 255  # luma by ITU-R BT.601
     mixed = (1 - np.abs(value)) * DIM * lightness[..., None] + np.abs(value) * colour
     return np.round(255 * mixed).astype(np.uint8)
@@ -117,28 +115,35 @@ def draw_pictures(
     title: str | None = None,
 ) -> Figure:
     """Draw rows of pictures under heads, and the bar of their colours with words below."""
-    step = _CELL_IN + 0.06
-    bottoms = np.cumsum([step + (0.2 if any(row.words) else 0) for row in rows]) + _HEAD_IN
-    small: Any = {"fontsize": 7.5, "ha": "center", "parse_math": False}
-    aside: Any = {"fontsize": 8.5, "ha": "right", "va": "center", "parse_math": False}
+    gap, foot = 0.25 if any(row.words for row in rows) else 0.06, 0.8 if bar else 0.1
+    across, down = len(heads) * (_CELL_IN + 0.06), len(rows) * (_CELL_IN + gap)
+    width, height = _SIDE_IN + max(across, _BAR_IN), _HEAD_IN + down + foot
+    small: Any = {"fontsize": 7.5, "parse_math": False}
     with drawing_style():
-        # placed by hand: laying out a hundred axes takes seconds
-        figure = Figure(figsize=(_SIDE_IN + max(step * len(heads), _BAR_IN), bottoms[-1] + (0.8 if bar else 0.1)))
-        place_text(figure, 0.1, 0.05, title or "", fontsize=11, fontweight="bold", parse_math=False)
-        for row, top in zip(rows, [_HEAD_IN, *bottoms], strict=False):
+        figure = Figure(figsize=(width, height))
+        figure.text(0.1 / width, 1 - 0.05 / height, title or "", va="top", fontsize=11, weight="bold", parse_math=False)
+        # a fixed grid: laying out a hundred axes takes seconds
+        grid = figure.add_gridspec(
+            len(rows), len(heads), wspace=0.06 / _CELL_IN, hspace=gap / _CELL_IN,
+            left=_SIDE_IN / width, right=(_SIDE_IN + across - 0.06) / width,
+            top=1 - _HEAD_IN / height, bottom=(foot + gap) / height,
+        )  # fmt: skip
+        for line, row in enumerate(rows):
             name = row.name if row.full is None else f"{row.name}\nfull colour: {row.full:.2g}"
-            place_text(figure, _SIDE_IN - 0.1, top + _CELL_IN / 2, fill(name, 20, replace_whitespace=False), **aside)
             for column, picture in enumerate(row.pictures):
-                ax = place_axes(figure, _SIDE_IN + column * step, top, _CELL_IN, _CELL_IN)
+                ax = figure.add_subplot(grid[line, column], xticks=[], yticks=[])
                 # large pictures are smoothed, so that thin outlines do not break
                 ax.imshow(picture, interpolation="none" if len(picture) <= _SHARP_PX else "antialiased")
-                ax.set_axis_off()
-            for column, text in enumerate(row.words):
-                place_text(figure, _SIDE_IN + column * step + _CELL_IN / 2, top + _CELL_IN + 0.03, text, **small)
-        for column, text in enumerate(heads):
-            place_text(figure, _SIDE_IN + column * step + _CELL_IN / 2, _HEAD_IN - 0.05, text, va="bottom", **small)
+                ax.spines[:].set_visible(False)
+                if not line:
+                    ax.set_title(heads[column], loc="center", fontweight="normal", pad=4, **small)
+                if row.words:
+                    ax.set_xlabel(row.words[column], labelpad=2, **small)
+                if not column:
+                    aside = fill(name, 20, replace_whitespace=False)
+                    ax.set_ylabel(aside, rotation=0, ha="right", va="center", fontsize=8.5, parse_math=False)
         if bar:
-            place = place_axes(figure, _SIDE_IN, bottoms[-1] + 0.1, _BAR_IN, 0.12)
+            place = figure.add_axes((_SIDE_IN / width, (foot - 0.22) / height, _BAR_IN / width, 0.12 / height))
             colours = ScalarMappable(Normalize(-1, 1), SIGN_COLOURS)
             colour_bar = figure.colorbar(colours, cax=place, orientation="horizontal", ticks=[-1, 0, 1])
             colour_bar.ax.set_xticklabels(["\N{MINUS SIGN}full colour", "0", "+full colour"], fontsize=7)

@@ -3,18 +3,14 @@
 import base64
 import io
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 from cycler import cycler
-from jaxtyping import Float
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.ticker import FixedFormatter
@@ -23,7 +19,6 @@ from PIL import Image
 from sliplens.errors import InputError
 from sliplens.explainers.table import EXPLAINERS
 from sliplens.files import whole_file
-from sliplens.intervals import Difference
 from sliplens.progress import visible
 from sliplens.results.faithfulness import CHANCE, NEW_WEIGHTS, is_control
 
@@ -38,7 +33,6 @@ UNKNOWN = "\N{EN DASH}"
 INPUT_NAMES = {"raw": "Raw images", "difference": "Difference images", "pair": "Image pairs", "rgb": "Images"}
 INPUT_COLOURS = {"raw": ORANGE, "difference": BLUE, "pair": GREEN}
 CONDITION_COLOURS = {"dry": ORANGE, "wet": BLUE}
-SOURCE_NAMES = {"simulated": "simulated touch", "real": "real touch"}
 
 CONTROL_NAMES = {
     "edges": "Edge filter (control)",
@@ -118,21 +112,6 @@ def method_name(name: str) -> str:
     return CONTROL_NAMES.get(name) or (EXPLAINERS[name].title if name in EXPLAINERS else name)
 
 
-def method_colour(name: str) -> str:
-    """Return the colour of a method in figures."""
-    return BLACK if name == CHANCE else EXPLAINERS[name].colour if name in EXPLAINERS else PURPLE
-
-
-def method_line(name: str) -> Any:
-    """Return the line style of a method in figures."""
-    return ":" if name == CHANCE else EXPLAINERS[name].line if name in EXPLAINERS else "-"
-
-
-def source_name(name: str) -> str:
-    """Return the display name of the frames' origin."""
-    return SOURCE_NAMES.get(name, name)
-
-
 def in_order(names: Iterable[str], order: Iterable[str]) -> list[str]:
     """Sort names in an order, then the others by the alphabet."""
     rank = {name: index for index, name in enumerate(order)}
@@ -172,13 +151,6 @@ def listed(texts: Sequence[str]) -> str:
 def conditions_in_order(names: Iterable[str]) -> list[str]:
     """Sort conditions: dry before wet before any other."""
     return in_order(set(names), ("dry", "wet"))
-
-
-def tell_ends(gap: Difference, write: Callable[[float], str], *, title: str = "") -> str:
-    """Write the ends of a 95 % interval, or that there is none."""
-    if gap.low is None or gap.high is None:
-        return "no interval of one trial"
-    return f"{title}{write(gap.low)} to {write(gap.high)}"
 
 
 def percent(value: float | None, *, digits: int = 0) -> str:
@@ -252,63 +224,17 @@ def written_whole(path: Path) -> Iterator[Path]:
         raise InputError(f"cannot write {path} ({error.strerror}); choose another file") from None
 
 
-def place_axes(figure: Figure, x: float, top: float, width: float, height: float) -> Axes:
-    """Add axes with their left upper corner and size in inches, measured from that of the page."""
-    across, down = figure.get_size_inches()
-    return figure.add_axes((x / across, 1 - (top + height) / down, width / across, height / down))
-
-
-def place_text(figure: Figure, x: float, top: float, text: str, **settings: Any) -> None:
-    """Write text at a place in inches, by default the left upper corner of the text."""
-    across, down = figure.get_size_inches()
-    figure.text(x / across, 1 - top / down, text, **{"va": "top", **settings})
-
-
-def shade_withheld(across: Float[np.ndarray, " frames"], reasons: Sequence[str | None], *, ax: Axes) -> None:
-    """Shade the frames with a withheld margin, at their places `across`, with the reasons in the legend."""
-    edges = np.concatenate([across[:1], (across[1:] + across[:-1]) / 2, across[-1:]])
-    labels: set[str] = set()
-    for reason, frames in groupby(range(len(reasons)), key=lambda at: reasons[at]):
-        if not reason:
-            continue
-        first, *others = frames
-        start, end = edges[first], edges[[first, *others][-1] + 1]
-        if start == end:  # a single frame
-            start, end = start - 0.5, end + 0.5
-        label = f"withheld: {reason.partition(';')[0]}"
-        ax.axvspan(start, end, color=GREY, alpha=0.3, linewidth=0, label=None if label in labels else label)
-        labels.add(label)
-
-
-def write_over(ax: Axes, words: str, **settings: Any) -> None:
-    """Write in the middle of empty axes why they are empty."""
-    ax.text(0.5, 0.5, words, transform=ax.transAxes, ha="center", va="center", color=GREY, **settings)
-
-
-_CSS_PIXELS_PER_INCH = 96
 _DOTS_PER_INCH = 144  # photographs of 224 pixels shown 1.5 inches wide, about pixel for pixel
 
 
-@dataclass(frozen=True, kw_only=True)
-class Picture:
-    """An image as a data URI, with its alternative text and its size in CSS pixels."""
-
-    uri: str
-    alt: str
-    width: int
-    height: int
-
-
-def figure_picture(figure: Figure, *, alt: str, pixels: bool = False) -> Picture:
-    """Convert a figure to SVG, or with `pixels` to PNG, which is smaller for photographs."""
+def figure_uri(figure: Figure, *, pixels: bool = False) -> str:
+    """Convert a figure to a data URI of SVG, or with `pixels` of PNG, which is smaller for photographs."""
     buffer = io.BytesIO()
     _escape_texts(figure)
     with drawing_style():
         if pixels:
-            # as bare pixels: encoding a PNG to decode it again takes as long as drawing
-            figure.savefig(buffer, format="rgba", dpi=_DOTS_PER_INCH)
-            size = [int(side * _DOTS_PER_INCH) for side in figure.get_size_inches()]
-            image = Image.frombytes("RGBA", (size[0], size[1]), buffer.getvalue()).convert("RGB")
+            figure.savefig(buffer, format="png", dpi=_DOTS_PER_INCH)
+            image = Image.open(buffer).convert("RGB")
             # 256 colours are a fourth of the size; by octree they are spread evenly, not given to the noise of a map
             reduced = image.quantize(256, method=Image.Quantize.FASTOCTREE)
             # colours are means: paper would not be quite white
@@ -317,6 +243,4 @@ def figure_picture(figure: Figure, *, alt: str, pixels: bool = False) -> Picture
         else:
             # no date: the same results make the same page
             figure.savefig(buffer, format="svg", dpi=200, metadata={"Date": None, "Creator": None})
-    width, height = (round(side * _CSS_PIXELS_PER_INCH) for side in figure.get_size_inches())
-    uri = f"data:image/{'png' if pixels else 'svg+xml'};base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
-    return Picture(uri=uri, alt=alt, width=width, height=height)
+    return f"data:image/{'png' if pixels else 'svg+xml'};base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"

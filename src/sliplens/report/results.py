@@ -7,14 +7,13 @@ from typing import Any
 from sliplens.codec import load_record, load_result
 from sliplens.errors import InputError
 from sliplens.files import RUN_FILE, Provenance, require_folder
-from sliplens.grip.records import Grip
 from sliplens.results.evaluation import Evaluation, Training
 from sliplens.results.explanation import Explanation, Strip
 from sliplens.results.study import CONFIG_FILE, RECORDS, TABLES, TESTS, Study, StudyConfig
 
-_KINDS = RECORDS | {"train": Training, "evaluate": Evaluation, "grip": Grip}
+_KINDS = RECORDS | {"train": Training, "evaluate": Evaluation}
 """Record of each stage."""
-_COMMANDS = ("train", "evaluate", "explain", "score", "grip")
+_COMMANDS = ("train", "evaluate", "explain", "score")
 """Stages that a command of their name makes; a study makes the others."""
 _BY_SOURCE = ("explain", "score", "faithfulness")
 """Stages of which a workspace may hold two results of an input: of simulated and of real touch."""
@@ -29,8 +28,6 @@ class Results(Study):
     trainings: dict[str, Training] = field(default_factory=dict)
     real: dict[str, Explanation] = field(default_factory=dict)
     """Explanations of frames of a real sensor, where the others are of simulated frames."""
-    grip: Grip | None = None
-    """An object held with the margin in the loop."""
     strip: Strip | None = None
     """One trial from stick to slip."""
     notes: tuple[str, ...] = ()
@@ -98,7 +95,6 @@ def load_results(workspace: Path) -> Results:
         runs={folder.name: run for folder, run in runs},
         trainings=of("train"),
         real=of("explain", "real") if source != "real" else {},
-        grip=of("grip").get(""),
         strip=next(iter(of("strip").values()), None),
         notes=tuple(notes),
     )

@@ -1,35 +1,236 @@
-"""Sections of the page: a table, of which those are drawn whose results are there."""
+"""First page, sections, tables and alarms of the page; cells of tables are text."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-from sliplens.plots.style import fill_name, input_name, inputs_in_order, listed, method_name, name_methods
-from sliplens.progress import number_of
-from sliplens.report import charts, plates, tables
+from sliplens.plots import style
+from sliplens.plots.style import fill_name, input_name, inputs_in_order, listed, name_methods
+from sliplens.report import plates, verdict
 from sliplens.report.results import Results
-from sliplens.report.verdict import MethodRow, answer_trust, load_thesis, why_no_verdict
-from sliplens.results.explanation import BASELINES, Explanation
+from sliplens.results.explanation import BASELINES
+from sliplens.results.faithfulness import DeletionScores, Faithfulness, RemovalScore, is_control
 from sliplens.results.study import TESTS
 
-OF_PACKAGE = "These are results on the simulated networks of the thesis that come with sliplens, not on this workspace."
+Kind = Literal["name", "number", "best", "thesis", "outcome"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Notes:
-    """Sentences under a head of their own: alarms, or what was done."""
+class Cell:
+    """Text of a cell, and what it is: a name, a number, the best number of its group, or a figure of the thesis."""
 
-    layout: ClassVar[str] = "notes"
-
-    title: str
-    sentences: tuple[str, ...]
-    tone: Literal["plain", "caution"] = "plain"
+    text: str
+    kind: Kind = "number"
 
 
-Block = tables.CellTable | plates.Plate | Notes
-"""Laid out by the template's macro of the name `layout`."""
-Blocks = Iterator[Block | None]
-"""None stands for a block that is not there."""
+@dataclass(frozen=True, kw_only=True)
+class CellTable:
+    """A table with its caption."""
+
+    layout: ClassVar[str] = "table"
+
+    caption: str
+    head: tuple[Cell, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    wrap: bool = False
+    """True where the cells hold sentences."""
+
+
+def make_table(
+    caption: str, heads: Sequence[str], rows: Sequence[Sequence[str | Cell]], *, names: int = 1, wrap: bool = False
+) -> CellTable:
+    """Make a table without its empty columns; the first hold names, the others numbers, some of the thesis."""
+    kinds: list[Kind] = [
+        "name" if place < names else "thesis" if "thesis" in head.lower() else "number"
+        for place, head in enumerate(heads)
+    ]
+    cells = [
+        [cell if isinstance(cell, Cell) else Cell(text=cell, kind=kind) for cell, kind in zip(row, kinds, strict=True)]
+        for row in rows
+    ]
+    filled = [place for place in range(len(heads)) if any(row[place].text for row in cells)]
+    head = tuple(Cell(text=heads[place], kind="thesis" if kinds[place] == "thesis" else "name") for place in filled)
+    texts = tuple(tuple(row[place] for place in filled) for row in cells)
+    return CellTable(caption=caption, head=head, rows=texts, wrap=wrap)
+
+
+def _best(text: str, best: bool) -> Cell:
+    return Cell(text=text, kind="best" if best else "number")
+
+
+def _outcome(outcome: str) -> Cell:
+    return Cell(text="open" if outcome == "undecided" else outcome, kind="outcome")
+
+
+def _two_lines(text: str) -> str:
+    """Set an interval below its estimate, so that every column fits."""
+    return text.replace(" (", "\n").rstrip(")")
+
+
+def table_methods(rows: Sequence[verdict.MethodRow]) -> CellTable:
+    """Tabulate every method beside the best control."""
+    beside = (
+        " Beside it the rank correlation of the map's means over markers with their Shapley values, put back to the "
+        "stick frame or to the untouched sensor, to which Integrated Gradients is close by construction."
+    )
+    return make_table(
+        "Every method beside the best control, a map that uses nothing the network learned. Truth: correlation of a "
+        "map's sums over groups of markers with the change of this prediction as a group is moved to another margin of "
+        "the trial; on recordings, the symmetric gain of removal in margin units. Ahead or behind: beyond the 95 % "
+        "interval over days and trials of one network; tied: neither."
+        f"{beside if any(row.shapley for row in rows) else ''}",
+        ("Method", "Input", "Status", "Truth", "Best control", "Lead", "Shapley, stick", "Shapley, untouched"),
+        [
+            (
+                style.method_name(row.method),
+                style.short_input_name(row.input),
+                _outcome(row.status),
+                _two_lines(row.score),
+                row.control.replace(", ", "\n"),
+                *map(_two_lines, (row.lead, row.stick, row.shapley)),
+            )
+            for row in rows
+        ],
+        names=2,
+        wrap=True,
+    )
+
+
+def table_claims(caption: str, rows: Sequence[verdict.ClaimRow]) -> CellTable:
+    """Tabulate claims, each beside its number; those of the thesis with their place and number there."""
+    cells = []
+    for row in rows:
+        why = Cell(text=row.why, kind="name")
+        cells.append((row.claim, row.source, row.subject, _outcome(row.outcome), row.thesis, row.ours, why))
+    heads = ("Claim", "Where", "Network", "Outcome", "Thesis", "Ours", "Why")
+    return make_table(caption, heads, cells, names=3, wrap=True)
+
+
+def table_accuracy(results: Results) -> CellTable:
+    """Tabulate MSE, R2 and MAE by condition and input (thesis, Table 1)."""
+    evaluations = {name: results.evaluations[name] for name in style.inputs_in_order(results.evaluations)}
+    conditions = style.conditions_in_order(
+        name for evaluation in evaluations.values() for name in evaluation.conditions
+    )
+    rows = []
+    for condition in conditions:
+        scores = {name: each.conditions.get(condition) for name, each in evaluations.items()}
+        scores = {name: score for name, score in scores.items() if score}
+        lowest = min(score.mse for score in scores.values())
+        for name, score in scores.items():
+            mse, r2 = verdict.ACCURACY.get((name, condition), (None, None))
+            rows.append(
+                (
+                    condition.capitalize(),
+                    style.input_name(name),
+                    _best(style.decimals(score.mse, 4), len(evaluations) > 1 and score.mse == lowest),
+                    style.decimals(mse, 4),
+                    style.decimals(score.r2, 3),
+                    style.decimals(r2, 2),
+                    style.decimals(100 * score.mae, 1),
+                    _outcome(verdict.judge_accuracy(score)),
+                    f"{score.frames} / {score.trials}",
+                )
+            )
+    text = "".join(
+        f" {style.input_name(name)}: the network was told the friction, {evaluation.friction}."
+        for name, evaluation in evaluations.items()
+        if evaluation.friction
+    )
+    return make_table(
+        "Error of each network on test trials. MSE in squared margin units (Γ from 0 to 1), MAE in percentage points "
+        "of Γ; the lower MSE of each condition is bold. Holds: better than always predicting the mean label, over five "
+        f"trials or more. Each input stands for one trained network. Grey columns: the {verdict.MARK}.{text}",
+        ("Objects", "Input", "MSE", "MSE, thesis", "R²", "R², thesis", "MAE (points)", "Outcome", "Frames / trials"),
+        rows,
+        names=2,
+    )
+
+
+def table_scores(name: str, faithful: Faithfulness | None, scored: DeletionScores | None) -> CellTable:
+    """Tabulate the thesis's deletion score (its Table 2) beside the symmetric gain under every fill."""
+    scores = {} if faithful is None else {score.key: score for score in faithful.scores}
+    plain, every = {} if scored is None else scored.methods, verdict.settings(faithful) if faithful else []
+    methods = {*(method for _, _, method in scores), *plain}
+    lowest = min((score.mean for method, score in plain.items() if not is_control(method)), default=None)
+    rows = []
+    for method in style.methods_in_order(methods):
+        score, published = plain.get(method), verdict.DELETION.get((name, verdict.thesis_row(method, methods)))
+        rows.append(
+            (
+                style.method_name(method),
+                _best(f"{score.mean:.3f} ± {score.sd:.3f}", score.mean == lowest) if score else style.UNKNOWN,
+                "{:.3f} ± {:.3f}".format(*published) if published else style.UNKNOWN,
+                *(_gain_cell(scores.get((*setting, method))) for setting in every),
+            )
+        )
+    over = next((f" over {score.srg.over}" for score in scores.values()), "")
+    text = (
+        f" Symmetric relevance gain, SRG, in margin units (0 = uninformative), with 95 % intervals{over}; * = "
+        "excludes zero. Bold: ahead of every control beyond the interval of the difference; otherwise the method has "
+        "shown nothing about this network under that fill."
+    )
+    return make_table(
+        f"{style.input_name(name)}: deletion score D of the thesis{f', {scored.fill} fill' if scored else ''}, mean ± "
+        "standard deviation over frames; lower = more faithful, the lowest is bold."
+        f"{text if scores else ''} Grey column: the {verdict.MARK}.",
+        ("Method", "Score D", "Score D, thesis", *(f"SRG, {style.fill_name(*setting)}" for setting in every)),
+        rows,
+    )
+
+
+def _gain_cell(score: RemovalScore | None) -> Cell:
+    if score is None:
+        return Cell(text=style.UNKNOWN)
+    lead = score.lead_over_controls
+    text = _two_lines(verdict.write_gap(score.srg)).replace("\n", "*\n" if score.srg.sure else "\n")
+    return _best(text, lead is not None and lead.shows_something)
+
+
+def table_properties(results: Results) -> CellTable:
+    """Tabulate what the maps of each method look like, and what they cost."""
+    rows = []
+    for name in style.inputs_in_order(results.map_quality):
+        looks = results.map_quality[name].methods
+        costs = results.explanations[name].methods if name in results.explanations else {}
+        rows += [
+            (
+                style.input_name(name),
+                style.method_name(method),
+                style.decimals(looks[method].resolution, 3),
+                style.decimals(looks[method].total_variation, 3),
+                style.decimals(looks[method].infidelity, 3),
+                style.decimals(looks[method].max_sensitivity, 2),
+                style.decimals(costs[method].seconds_per_frame if method in costs else None, 3),
+                style.decimals(verdict.SECONDS.get(verdict.thesis_row(method, looks)), 3),
+            )
+            for method in style.methods_in_order(looks)
+        ]
+    return make_table(
+        "Resolution: depth of the valley between neighbouring markers (1 = told apart). Total variation: mean step "
+        "between pixels over the map's range (noise has 1/3). Infidelity: error of the change that a map predicts if "
+        "half of the pixels become the baseline's, in units of the output; max-sensitivity: largest change of a map "
+        "under noise of 2 %, as a share of the map (two frames each). Seconds a frame beside other work; the thesis "
+        "timed 224 px on an RTX 3060 Ti.",
+        (
+            "Input",
+            "Method",
+            "Resolution",
+            "Total variation",
+            "Infidelity",
+            "Max-sensitivity",
+            "Seconds",
+            "In the thesis",
+        ),
+        rows,
+        names=2,
+    )
+
+
+OF_PACKAGE = "These are results on the simulated networks of the thesis that come with sliplens, not on this workspace."
+
+Block = CellTable | plates.Plate | str
+"""Table, figure or paragraph of the page."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,22 +242,22 @@ class Opening:
     next_step: str
 
 
-def build_opening(results: Results, rows: Sequence[MethodRow]) -> Opening:
+def build_opening(results: Results, rows: Sequence[verdict.MethodRow]) -> Opening:
     """Build the first page from the study of a workspace, or from that of the package where it holds none."""
     strip = results.strip
     answer, reasons = "Not known: no explanation was scored yet.", []
     if rows:
-        reasons = [why_no_verdict(results, name) for name in dict.fromkeys(row.input for row in rows)]
-        answer = answer_trust(rows, reasons)
+        reasons = [verdict.why_no_verdict(results, name) for name in dict.fromkeys(row.input for row in rows)]
+        answer = verdict.answer_trust(rows, reasons)
     elif strip is not None and not results.begun:
-        rows = load_thesis().methods
-        answer = f"{answer_trust(rows)} {OF_PACKAGE}"
-    blocks = [
-        plates.plate_strip(strip) if strip else None,
-        plates.plate_moved(strip, strip.moved) if strip and strip.moved else None,
-        charts.plate_shift(load_thesis()) if strip and strip.source == "simulated" else None,
-        tables.table_methods(rows) if rows else None,
-    ]
+        rows = verdict.load_thesis().methods
+        answer = f"{verdict.answer_trust(rows)} {OF_PACKAGE}"
+    blocks: list[Block] = []
+    if strip is not None:
+        blocks.append(plates.plate_strip(strip))
+        blocks += [plates.plate_moved(strip, strip.moved)] if strip.moved else []
+        blocks += [plates.plate_shift(verdict.load_thesis())] if strip.source == "simulated" else []
+    blocks += [table_methods(rows)] if rows else []
     best = next((row.method for row in rows if row.status == "ahead"), None)
     if not results.begun:
         step = "judge the maps of your own network on your recordings: `sliplens study DATA --network RUN --quick`."
@@ -64,38 +265,106 @@ def build_opening(results: Results, rows: Sequence[MethodRow]) -> Opening:
         step = f"look at your own frames with the method that is ahead: `sliplens explain RUN DATA --method {best}`."
     else:
         step = "train on more trials until five of them are predicted within 5 points, and run the study again."
-    return Opening(answer=answer, blocks=tuple(block for block in blocks if block is not None), next_step=step)
+    return Opening(answer=answer, blocks=tuple(blocks), next_step=step)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """A part of the page; without any block it is left out."""
+    """A part of the page; it is left out without any block."""
 
     id: str
     title: str
     short_title: str
     intro: str
-    build: Callable[[Results], Blocks]
+    blocks: Sequence[Block]
     step: str = ""
-    """Step of a study that makes its results; the page names it where it was not run. Empty where no study has it."""
-    blocks: tuple[Block, ...] = ()
-    """In the order they are read, once it is built."""
+    """Step of a study that makes its results, named on the page where it was not run; empty where no study has it."""
 
 
 def build_sections(results: Results) -> tuple[Section, ...]:
-    """Build the sections whose results are there, in the order they are read; the last says what was not run."""
-    built, absent = [], []
+    """Build the sections in the order they are read; those whose results are not there have no block."""
     explained = (results.explanations | results.real).values()
     baseline = next((BASELINES[each.baseline] for each in explained), BASELINES["untouched"])
-    for section in SECTIONS:
-        blocks = tuple(block for block in section.build(results) if block is not None)
-        if blocks or section is RECIPE:
-            built.append(replace(section, intro=section.intro.replace("{baseline}", baseline), blocks=blocks))
-        elif results.begun and section.step and not (section.step == "truth" and results.source == "real"):
-            left_out = results.config is not None and section.step in set(TESTS) - set(results.config.tests)
-            absent += [] if left_out else [section.short_title]
-    missing = f" {', '.join(absent)}: not run yet; `sliplens study` makes it." if absent else ""
-    return *built[:-1], replace(built[-1], intro=f"{built[-1].intro}{missing}")
+    claims = "Claims of the thesis, its numbers, and ours with 95 % intervals over days and trials."
+    thesis = verdict.load_thesis() if results.begun or results.strip is not None else None
+    return (
+        Section(
+            id="real",
+            title="Real touch",
+            short_title="Real touch",
+            intro="Frames of a real sensor, shown to each network.",
+            blocks=[plates.plate_states(results, results.real[name]) for name in _names(results.real)],
+        ),
+        Section(
+            id="accuracy",
+            title="How well the safety margin is predicted",
+            short_title="Accuracy",
+            intro="Each network predicts trials that it was not trained on (Table 1 and Fig. 7 of the thesis, for this "
+            "data). A raw image is the camera's frame; a difference image is that frame against the untouched sensor; "
+            "in an image pair both stand side by side.",
+            blocks=[plates.plate_bins(results)] if results.evaluations else [],
+            step="evaluate",
+        ),
+        Section(
+            id="faithfulness",
+            title="How far the explanations can be believed",
+            short_title="Faithfulness",
+            intro="Parts of a frame are removed: the most supporting first, the least supporting first, and at random. "
+            f"With a faithful map the prediction returns to that of {baseline} at once in the first case, and not "
+            "in the second. Controls are maps that use nothing the network learned. The thesis's score beside it: D = "
+            "(1 \N{MINUS SIGN} |change of Γ|)² while pixels go, the most salient first, 1 where nothing changed; with "
+            "every pixel gone no map has a part in it.",
+            blocks=_score_blocks(results),
+            step="faithfulness",
+        ),
+        Section(
+            id="maps",
+            title="Where each network looks, and what the maps look like",
+            short_title="Saliency maps",
+            intro="From full stick (Γ 100 %) to the onset of full slip (Γ 0 %): why each network predicts its margin "
+            f"rather than that of {baseline}. The thesis judged the maps by eye; a study measures the same.",
+            blocks=[
+                *(plates.plate_states(results, results.explanations[name]) for name in _names(results.explanations)),
+                *([table_properties(results)] if results.map_quality else []),
+            ],
+            step="explain",
+        ),
+        Section(
+            id="choice",
+            title="Which trials were taken",
+            short_title="Trials",
+            intro="The trials and frames that are explained and scored.",
+            blocks=[
+                *([results.choice.summary] if results.choice else []),
+                *(f"{text[:1].upper()}{text[1:]}." for text in results.left_out.values()),
+                *(f"Truth, {name} images: {results.truth[name].summary}." for name in _names(results.truth)),
+            ],
+            step="choice",
+        ),
+        Section(
+            id="claims",
+            title="The claims of the thesis",
+            short_title="Claims",
+            intro="From a study of the two networks that come with sliplens, one an input, on simulated trials of "
+            "their sensor: not of this workspace. A claim holds or not beyond the interval; otherwise it is open.",
+            blocks=[table_claims(f"{claims} {thesis.sample}", thesis.claims)] if thesis else [],
+        ),
+    )
+
+
+def _score_blocks(results: Results) -> list[Block]:
+    scored, deletion = results.faithfulness, results.deletion
+    names = _names({*scored, *deletion})
+    blocks: list[Block] = [table_scores(name, scored.get(name), deletion.get(name)) for name in names]
+    curves = {name: deletion[name] for name in names if name in deletion}
+    return [*blocks, *([plates.plate_deletion(curves)] if curves else [])]
+
+
+def missing_sections(results: Results, sections: Sequence[Section]) -> list[str]:
+    """Short titles of the sections of a study that was asked for them and has not made them."""
+    left_out = set(TESTS) - set(results.config.tests) if results.config else set()
+    wanted = [each for each in sections if each.step and each.step not in left_out] if results.begun else []
+    return [each.short_title for each in wanted if not each.blocks]
 
 
 def _names(names: Iterable[str]) -> list[str]:
@@ -103,161 +372,19 @@ def _names(names: Iterable[str]) -> list[str]:
     return inputs_in_order(names)[::-1]
 
 
-def _notes(title: str, sentences: Iterable[str], *, tone: Literal["plain", "caution"] = "caution") -> Notes | None:
-    texts = dict.fromkeys(
-        f"{text[:1].upper()}{text[1:].rstrip('.')}." for text in map(name_methods, filter(None, sentences))
-    )
-    return Notes(title=title, sentences=tuple(texts), tone=tone) if texts else None
-
-
-def _alarms(name: str, *sentences: Iterable[str]) -> Notes | None:
-    return _notes(f"Alarms, {input_name(name).lower()}", (text for each in sentences for text in each))
-
-
-def _accuracy(results: Results) -> Blocks:
-    if results.evaluations:
-        yield charts.plate_bins(results)
-        yield charts.plate_predictions(results)
-
-
-def _faithfulness(results: Results) -> Blocks:
-    for name in _names({*results.faithfulness, *results.deletion}):
-        records = results.faithfulness.get(name), results.deletion.get(name)
-        yield tables.table_scores(name, *records)
-        yield _alarms(name, *(record.alarms for record in records if record is not None))
-    if deletion := results.deletion:
-        yield charts.plate_deletion({name: deletion[name] for name in _names(deletion)})
-
-
-def _maps(results: Results, explanations: Mapping[str, Explanation]) -> Blocks:
-    for name in _names(explanations):
-        explained = explanations[name]
-        yield plates.plate_states(results, explained)
-        warnings = {method_name(method): notes.warnings for method, notes in explained.methods.items()}
-        yield _alarms(name, (f"{method}: {text}" for method, texts in warnings.items() for text in texts))
-
-
-def _study_maps(results: Results) -> Blocks:
-    if results.states is not None:
-        yield _notes("Markers that could not be followed", results.states.untracked)
-    yield from _maps(results, results.explanations)
-    if results.map_quality or results.randomisation or results.timing:
-        yield tables.table_properties(results)
-    for name in _names(results.randomisation):
-        yield _alarms(name, results.randomisation[name].alarms)
-
-
-def _choice(results: Results) -> Blocks:
-    if (choice := results.choice) is not None:
-        sentences = [choice.summary, *results.left_out.values()]
-        yield _notes(f"{number_of(len(choice.trials), 'trial')} of {choice.condition} objects", sentences, tone="plain")
-
-
-def _truth(results: Results) -> Blocks:
-    for name in _names(results.truth):
-        truth = results.truth[name]
-        yield tables.table_localisation(truth)
-        unfit = [fill_name(test.fill) for test in truth.meta if not test.holds]
-        if unfit:
+def list_alarms(results: Results) -> list[str]:
+    """Sentences on what puts results in doubt, each once, in the order of the networks."""
+    alarms = [*results.notes, *(results.states.untracked if results.states else ())]
+    if len({tuple(sorted(run.versions.items())) for run in results.runs.values()}) > 1:
+        alarms.append("The stages were run with different versions of the libraries; see each run.json.")
+    tested, explained = (results.faithfulness, results.deletion), results.explanations
+    for name in _names({*results.truth, *(name for table in (*tested, explained, results.real) for name in table)}):
+        texts = [text for table in tested if name in table for text in table[name].alarms]
+        for maps in (table[name] for table in (explained, results.real) if name in table):
+            texts += [f"{method}: {text}" for method, notes in maps.methods.items() for text in notes.warnings]
+        truth = results.truth.get(name)
+        if unfit := [fill_name(test.fill) for test in (truth.meta if truth else ()) if not test.holds]:
             why = "a map of the Shapley values does not gain more than the same map with half of the markers shuffled"
-            yield _notes(f"Fills without a vote, {input_name(name).lower()}", [f"Under {listed(unfit)} {why}"])
-        yield _notes(f"How this was measured, {input_name(name).lower()}", [truth.summary], tone="plain")
-
-
-def _grip(results: Results) -> Blocks:
-    if results.grip is not None:
-        yield charts.plate_trace(results.grip)
-
-
-def _claims(results: Results) -> Blocks:
-    if results.begun or results.strip is not None:
-        thesis = load_thesis()
-        caption = "Claims of the thesis, its numbers, and ours with 95 % intervals over days and trials."
-        yield tables.table_claims(f"{caption} {thesis.sample}", thesis.claims)
-
-
-RECIPE = Section(
-    id="recipe",
-    title="How these results were made",
-    short_title="Recipe",
-    intro="Every stage is in a folder of its own; `sliplens report` draws this page from the folders alone, and "
-    "`sliplens study` with the same options goes on where it stopped.",
-    build=lambda _: iter(()),
-)
-SECTIONS: tuple[Section, ...] = (
-    Section(
-        id="real",
-        title="Real touch",
-        short_title="Real touch",
-        intro="Frames of a real sensor, shown to each network.",
-        build=lambda results: _maps(results, results.real),
-    ),
-    Section(
-        id="accuracy",
-        title="How well the safety margin is predicted",
-        short_title="Accuracy",
-        intro="Each network predicts trials that it was not trained on (Table 1 and Fig. 7 of the thesis, for this "
-        "data). A raw image is the camera's frame; a difference image is that frame against the untouched sensor; "
-        "in an image pair both stand side by side.",
-        build=_accuracy,
-        step="evaluate",
-    ),
-    Section(
-        id="grip",
-        title="What the margin holds",
-        short_title="Grip",
-        intro="A simulated gripper lifts an object and holds it while something happens; the predictions of the "
-        "fingertips decide how hard it presses. The least force that holds is the load over both frictions, which no "
-        "controller knows.",
-        build=_grip,
-    ),
-    Section(
-        id="faithfulness",
-        title="How far the explanations can be believed",
-        short_title="Faithfulness",
-        intro="Parts of a frame are removed: the most supporting first, the least supporting first, and at random. "
-        "With a faithful map the prediction returns to that of {baseline} at once in the first case, and not "
-        "in the second. Controls are maps that use nothing the network learned. The thesis's score beside it: D = "
-        "(1 \N{MINUS SIGN} |change of Γ|)² while pixels go, the most salient first, 1 where nothing changed; with "
-        "every pixel gone no map has a part in it.",
-        build=_faithfulness,
-        step="faithfulness",
-    ),
-    Section(
-        id="maps",
-        title="Where each network looks, and what the maps look like",
-        short_title="Saliency maps",
-        intro="From full stick (Γ 100 %) to the onset of full slip (Γ 0 %): why each network predicts its margin "
-        "rather than that of {baseline}. The thesis judged the maps by eye; a study measures the same.",
-        build=_study_maps,
-        step="explain",
-    ),
-    Section(
-        id="choice",
-        title="Which trials were taken",
-        short_title="Trials",
-        intro="The trials and frames that are explained and scored.",
-        build=_choice,
-        step="choice",
-    ),
-    Section(
-        id="truth",
-        title="What the network should have looked at",
-        short_title="Truth",
-        intro="Beside the neutral judge, whose effects no map is made to predict: Shapley values, the mean effect of "
-        "putting a marker back in the company of all others, to which Integrated Gradients is close by construction. "
-        "The best estimate of the margin is linear in the displacements and shows where the network should look.",
-        build=_truth,
-        step="truth",
-    ),
-    Section(
-        id="claims",
-        title="The claims of the thesis",
-        short_title="Claims",
-        intro="From a study of the two networks that come with sliplens, one an input, on simulated trials of their "
-        "sensor: not of this workspace. A claim holds or does not hold beyond the interval; otherwise it is open.",
-        build=_claims,
-    ),
-    RECIPE,
-)
-"""Sections in the order they are read."""
+            texts.append(f"under {listed(unfit)} {why}, so that this fill has no vote")
+        alarms += [f"{input_name(name)}: {name_methods(text).rstrip('.')}." for text in texts]
+    return list(dict.fromkeys(alarms))

@@ -8,7 +8,7 @@ Polak, *Explainable Neural Networks for Incipient Slip Sensing in Robot Tactile 
 the third digit of the recorded scores, the seconds on an RTX 3060 Ti and without device synchronisation.
 """
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from importlib.resources import as_file, files
@@ -19,21 +19,7 @@ import numpy as np
 
 from sliplens.codec import load_record
 from sliplens.intervals import FEWEST_UNITS, Difference, paired_difference
-from sliplens.plots.style import (
-    FILL_NAMES,
-    UNIT_NAMES,
-    UNKNOWN,
-    conditions_in_order,
-    fill_name,
-    in_order,
-    input_name,
-    inputs_in_order,
-    listed,
-    method_name,
-    methods_in_order,
-    signed,
-    tell_ends,
-)
+from sliplens.plots import style
 from sliplens.progress import number_of
 from sliplens.report.results import Results
 from sliplens.results.evaluation import RegressionScores, ScoredFrames
@@ -99,8 +85,8 @@ def compare_errors(first: ScoredFrames, second: ScoredFrames, *, rng: np.random.
 def settings(faithful: Faithfulness) -> list[tuple[str, str]]:
     """Fills and units that were scored, in the order they are read."""
     scored = {(fill, unit) for fill, unit, _ in faithful.curves}
-    fills = in_order({fill for fill, _ in scored}, FILL_NAMES)
-    units = in_order({unit for _, unit in scored}, UNIT_NAMES)
+    fills = style.in_order({fill for fill, _ in scored}, style.FILL_NAMES)
+    units = style.in_order({unit for _, unit in scored}, style.UNIT_NAMES)
     return [(fill, unit) for unit in units for fill in fills if (fill, unit) in scored]
 
 
@@ -115,14 +101,16 @@ def voting_settings(faithful: Faithfulness, *truths: Truth | None) -> list[tuple
     return [setting for setting in scored if units[setting[0]] == setting and setting[0] not in unfit]
 
 
-def write_ends(gap: Difference | None, *, digits: int = 3) -> str:
-    """Write the ends of a 95 % interval with signs; nothing where there is no estimate."""
-    return "" if gap is None else tell_ends(gap, partial(signed, digits=digits))
+def write_ends(gap: Difference, write: Callable[[float], str]) -> str:
+    """Write the ends of a 95 % interval, or that there is none."""
+    ends = gap.low is not None and gap.high is not None and (gap.low, gap.high)
+    return " to ".join(map(write, ends)) if ends else "no interval of one trial"
 
 
 def write_gap(gap: Difference | None, *, digits: int = 3) -> str:
     """Write an estimate with its 95 % interval, or a dash."""
-    return UNKNOWN if gap is None else f"{signed(gap.estimate, digits)} ({write_ends(gap, digits=digits)})"
+    write = partial(style.signed, digits=digits)
+    return style.UNKNOWN if gap is None else f"{write(gap.estimate)} ({write_ends(gap, write)})"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,6 +126,9 @@ class MethodRow:
     """Score less that of the strongest control, with its 95 % interval."""
     status: Status
     """Lead above zero for sure, neither, or below zero for sure."""
+    stick: str = ""
+    shapley: str = ""
+    """Agreement with Shapley values of the stick game and of the untouched game; empty where unknown."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,8 +177,8 @@ def without_weak(results: Results) -> tuple[Results, tuple[str, ...]]:
     }
     strip = None if results.strip is not None and results.strip.input in weak else results.strip
     text = (
-        f"The maps of {listed([input_name(name).lower() for name in weak])} are not shown: a network with R² under "
-        f"{SHOWN_R2:g} on test trials has nothing to explain but its errors."
+        f"The maps of {style.listed([style.input_name(name).lower() for name in weak])} are not shown: a network with "
+        f"R² under {SHOWN_R2:g} on test trials has nothing to explain but its errors."
     )
     return replace(results, strip=strip, **tables), (text,)
 
@@ -209,7 +200,7 @@ def why_no_verdict(results: Results, name: str) -> str | None:
 def judge_study(results: Results) -> tuple[MethodRow, ...]:
     """Judge the methods of all networks: by the neutral truth where the scene can be drawn anew, else by removal."""
     rows: list[MethodRow] = []
-    for name in inputs_in_order({*results.truth, *results.faithfulness})[::-1]:
+    for name in style.inputs_in_order({*results.truth, *results.faithfulness})[::-1]:
         truth, faithful = results.truth.get(name), results.faithfulness.get(name)
         verdict = why_no_verdict(results, name) is None
         if truth is not None and any(method.neutral is not None for method in truth.methods.values()):
@@ -221,55 +212,46 @@ def judge_study(results: Results) -> tuple[MethodRow, ...]:
 
 def judge_methods(truth: Truth, *, verdict: bool = True) -> list[MethodRow]:
     """Judge methods by the neutral truth, the best first; without a verdict where there is to be none."""
-    compared = [
-        (method.neutral, name, method.lead_over_controls)
-        for name, method in truth.methods.items()
-        if method.neutral is not None and method.lead_over_controls is not None
-    ]
-    write = partial(write_gap, digits=2)
-    return [
-        MethodRow(
+    rows, write = [], partial(write_gap, digits=2)
+    for name, method in truth.methods.items():
+        score, lead = method.neutral, method.lead_over_controls
+        if score is None or lead is None:
+            continue
+        control = style.method_name(lead.control).removesuffix(" (control)")
+        status: Status = "ahead" if lead.gap.above_zero else "behind" if lead.gap.below_zero else "tied"
+        row = MethodRow(
             input=truth.input,
             method=name,
             score=write(score),
-            control=f"{method_name(lead.control).removesuffix(' (control)')}, "
-            f"{signed(abs(score.estimate - lead.gap.estimate), 2)}",
+            control=f"{control}, {style.signed(abs(score.estimate - lead.gap.estimate), 2)}",
             lead=write(lead.gap),
-            status="no verdict"
-            if not verdict or score.units < FEWEST_UNITS
-            else "ahead"
-            if lead.gap.above_zero
-            else "behind"
-            if lead.gap.below_zero
-            else "tied",
+            stick=write(method.stick),
+            shapley=write(method.shapley),
+            status=status if verdict and score.units >= FEWEST_UNITS else "no verdict",
         )
-        for score, name, lead in sorted(compared, key=lambda item: -item[0].estimate)
-    ]
+        rows.append((score.estimate, row))
+    return [row for _, row in sorted(rows, key=lambda item: -item[0])]
 
 
 def _judge_by_removal(faithful: Faithfulness, truth: Truth | None, *, verdict: bool) -> list[MethodRow]:
     """Judge methods by the fills under which they beat chance and the best control, the best method first."""
-    scores = {score.key: score for score in faithful.scores}
-    ranked: list[tuple[float, MethodRow]] = []
-    for method in methods_in_order(score.method for score in faithful.scores if not score.control):
-        leads = {
-            setting: lead
-            for setting in voting_settings(faithful, truth)
-            if (score := scores.get((*setting, method))) and (lead := score.lead_over_controls) is not None
-        }
-        gain = float(np.mean([scores[*setting, method].srg.estimate for setting in leads])) if leads else -np.inf
-        ahead = [fill_name(*setting) for setting, lead in leads.items() if lead.shows_something]
-        status: Status = "ahead" if 2 * len(ahead) > len(leads) else "tied" if ahead else "behind"
+    scores, rows = {score.key: score for score in faithful.scores}, []
+    for method in style.methods_in_order(score.method for score in faithful.scores if not score.control):
+        voting = [scores.get((*setting, method)) for setting in voting_settings(faithful, truth)]
+        judged = [(score, score.lead_over_controls) for score in voting if score and score.lead_over_controls]
+        gain = float(np.mean([score.srg.estimate for score, _ in judged])) if judged else -np.inf
+        ahead = sum(lead.shows_something for _, lead in judged)
+        status: Status = "ahead" if 2 * ahead > len(judged) else "tied" if ahead else "behind"
         row = MethodRow(
             input=faithful.input,
             method=method,
-            score=signed(gain, 3) if leads else UNKNOWN,
+            score=style.signed(gain, 3) if judged else style.UNKNOWN,
             control="the best under each fill",
-            lead=f"ahead under {len(ahead)} of {number_of(len(leads), 'fill')}",
-            status=status if verdict and leads and faithful.trials >= FEWEST_UNITS else "no verdict",
+            lead=f"ahead under {ahead} of {number_of(len(judged), 'fill')}",
+            status=status if verdict and judged and faithful.trials >= FEWEST_UNITS else "no verdict",
         )
-        ranked.append((gain, row))
-    return [row for _, row in sorted(ranked, key=lambda item: -item[0])]
+        rows.append((gain, row))
+    return [row for _, row in sorted(rows, key=lambda item: -item[0])]
 
 
 def answer_trust(rows: Sequence[MethodRow], reasons: Iterable[str | None] = ()) -> str:
@@ -277,12 +259,14 @@ def answer_trust(rows: Sequence[MethodRow], reasons: Iterable[str | None] = ()) 
     answer = []
     for name in dict.fromkeys(row.input for row in rows):
         judged = {row.method: row.status for row in rows if row.input == name}
-        ahead = [method_name(method) for method, status in judged.items() if status == "ahead"]
-        rest = [method_name(method) for method, status in judged.items() if status in {"tied", "behind"}]
+        ahead = [style.method_name(method) for method, status in judged.items() if status == "ahead"]
+        rest = [style.method_name(method) for method, status in judged.items() if status in {"tied", "behind"}]
         nothing = "a map that knows nothing of the network"
-        text = f"yes, {listed(ahead)}" if ahead else f"no; no method is ahead of {nothing}" if rest else "not known"
-        text += f"; no, {listed(rest)}, which do no better than {nothing}" if ahead and rest else ""
-        answer.append(f"{input_name(name)}: {text}.")
+        text = (
+            f"yes, {style.listed(ahead)}" if ahead else f"no; no method is ahead of {nothing}" if rest else "not known"
+        )
+        text += f"; no, {style.listed(rest)}, which do no better than {nothing}" if ahead and rest else ""
+        answer.append(f"{style.input_name(name)}: {text}.")
     answer += [f"{reason[:1].upper()}{reason[1:]}." for reason in dict.fromkeys(filter(None, reasons))]
     return " ".join(answer)
 
@@ -317,16 +301,16 @@ def judge_results(results: Results, *, rng: np.random.Generator) -> tuple[ClaimR
 
 def _judge_networks(results: Results, *, rng: np.random.Generator) -> Iterator[ClaimRow]:
     evaluations = results.evaluations
-    scores = {name: evaluations[name].conditions for name in inputs_in_order(evaluations)}
+    scores = {name: evaluations[name].conditions for name in style.inputs_in_order(evaluations)}
     for pair in combinations(scores, 2):
-        for condition in conditions_in_order(set(scores[pair[0]]) & set(scores[pair[1]])):
+        for condition in style.conditions_in_order(set(scores[pair[0]]) & set(scores[pair[1]])):
             better, worse = sorted(pair, key=lambda name: scores[name][condition].mse)
             tables = [evaluations[name].predictions for name in (worse, better)]
             gap = compare_errors(*(table.where(table.condition == condition) for table in tables), rng=rng)
             over = f"over {gap.over}" if gap else "not tested: the networks did not predict the same frames"
             yield ClaimRow(
-                claim=f"Smaller error than {input_name(worse).lower()} on {condition} objects",
-                subject=input_name(better),
+                claim=f"Smaller error than {style.input_name(worse).lower()} on {condition} objects",
+                subject=style.input_name(better),
                 outcome=judge_gap(gap),
                 why=f"Difference of the MSE, {over}.",
                 ours=write_gap(gap, digits=4),
@@ -335,31 +319,20 @@ def _judge_networks(results: Results, *, rng: np.random.Generator) -> Iterator[C
 
 def _judge_real_touch(results: Results) -> Iterator[ClaimRow]:
     real = results.real or (results.explanations if results.source == "real" else {})
-    for name in inputs_in_order(real):
+    for name in style.inputs_in_order(real):
         frames = [frame for frame in real[name].frames if frame.safety_margin is not None]
-        labels = np.array([frame.safety_margin for frame in frames], dtype=np.float64)
-        trials = len({frame.trial for frame in frames})
-        number, outcome, why = (
-            UNKNOWN,
-            "undecided",
-            f"None of {number_of(len(real[name].frames), 'frame')} has a label.",
-        )
+        trials, number, outcome = len({frame.trial for frame in frames}), style.UNKNOWN, "undecided"
+        why = f"None of {number_of(len(real[name].frames), 'frame')} has a label."
         if frames:
-            error = np.abs(labels - [frame.prediction for frame in frames]).mean()
-            constant = np.abs(labels - np.median(labels)).mean()
-            number = f"{100 * error:.0f} points"
-            outcome = "undecided" if trials < FEWEST_UNITS else "holds" if error < constant else "does not hold"
-            why = (
-                f"Mean error on {number_of(len(frames), 'frame')} of {number_of(trials, 'trial')}; the best constant "
-                f"is off by {100 * constant:.0f} points."
-            )
-        yield ClaimRow(
-            claim="Predicts real touch better than a constant",
-            subject=input_name(name),
-            outcome=outcome,
-            why=why,
-            ours=number,
-        )
+            labels = np.array([frame.safety_margin for frame in frames], dtype=np.float64)
+            error = 100 * np.abs(labels - [frame.prediction for frame in frames]).mean()
+            constant, number = 100 * np.abs(labels - np.median(labels)).mean(), f"{error:.0f} points"
+            if trials >= FEWEST_UNITS:
+                outcome = "holds" if error < constant else "does not hold"
+            of_trials = f"{number_of(len(frames), 'frame')} of {number_of(trials, 'trial')}"
+            why = f"Mean error on {of_trials}; the best constant is off by {constant:.0f} points."
+        claim = "Predicts real touch better than a constant"
+        yield ClaimRow(claim=claim, subject=style.input_name(name), outcome=outcome, why=why, ours=number)
 
 
 # the claims of the thesis, as they come with the package (`python benchmarks/claims.py`)

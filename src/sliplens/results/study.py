@@ -150,41 +150,33 @@ class UntrainedMaps(OfNetwork):
 class MapMeasures:
     """Properties of a method's maps beside their scores, as means over frames; None where undefined or not measured."""
 
-    resolution: float | None = None
-    total_variation: float | None = None
+    resolution: float | None
+    total_variation: float | None
     infidelity: Annotated[float, ANSWER] | None = None
     """Error of the changes that maps of a few frames predict, in margin units (`controls.infidelity`)."""
     max_sensitivity: float | None = None
     """Largest relative change of the same maps under small noise (`controls.max_sensitivity`)."""
-    layers: tuple[int, ...] = ()
-    similarity: tuple[float | None, ...] = ()
-    """Of the maps with those of the network with new weights in so many layers."""
-    seconds: Annotated[float, AMOUNT] | None = None
-    """Median time to explain one frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MapQuality(OfNetwork):
-    """Looks of maps, their dependence on the weights, or their cost, by method."""
+    """Looks of maps by method."""
 
     frames: int
     methods: dict[str, MapMeasures]
     comparisons: tuple[MethodGap, ...] = ()
     """Of the total variation."""
-    alarms: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
 class Localisation:
-    """How far a method's maps agree with what markers do to the prediction and the margin."""
+    """How far a method's maps agree with what markers do to the prediction."""
 
     neutral: Difference | None
     """Mean correlation (Pearson, signed) of the map's sums over groups of markers with the change of the prediction as
     the group is moved to another margin of the trial: the main judge. The fields beside it are other truths."""
     stick: Difference | None
     shapley: Difference | None
-    network: Difference | None
-    margin: Difference | None
     """Mean rank correlation, signed, of the map's means over the markers with the columns of `MarkerEffects`."""
     lead_over_controls: Lead | None
     """Of `neutral`; None for what is no method, or where it is undefined."""
@@ -214,7 +206,7 @@ class MetaTest:
 
 @dataclass(frozen=True, kw_only=True)
 class MarkerEffects(Columns):
-    """Effect of each marker on the network's prediction and on the true margin, a row a marker and frame."""
+    """Effect of each marker on the network's prediction, a row a marker and frame."""
 
     frame_id: Shaped[np.ndarray, " rows"]
     day: Int64[np.ndarray, " rows"]
@@ -230,10 +222,6 @@ class MarkerEffects(Columns):
     stick: Annotated[Float64[np.ndarray, " rows"], ANSWER, UNKNOWN]
     """Shapley value with markers put back to their places in the stick frame that is the baseline of the explanation;
     NaN where that is the untouched sensor."""
-    network: Annotated[Float64[np.ndarray, " rows"], ANSWER]
-    margin: Annotated[Float64[np.ndarray, " rows"], ANSWER]
-    """Answer and best reading as they are less those with the marker put back, in margin units. The reading is linear:
-    these are its Shapley values too."""
     state: Int64[np.ndarray, " rows"]
     """Slips (1), sticks (2), or lies outside of the contact (0)."""
 
@@ -261,21 +249,16 @@ class Truth(OfNetwork):
     Spearman-Brown)."""
     pairs: int
     """Pairs of scenes drawn for the Shapley values of each frame."""
-    reliability: Difference | None
-    """Expected correlation of the Shapley values with a second estimate, by their standard errors; its root is the most
-    that a map can reach."""
     meta: tuple[MetaTest, ...]
     effects: MarkerEffects
     neutral: NeutralScores
 
     @property
     def summary(self) -> str:
-        """How many frames and scenes were drawn, and how sure the truths are."""
-        sure = {"neutral scores": self.neutral_reliability}
-        sure |= {"Shapley values": self.reliability and self.reliability.estimate}
-        words = [f"{name} {value:.2f}" for name, value in sure.items() if value is not None]
+        """How many frames and scenes were drawn, and how sure the main judge is."""
         drawn = f"{number_of(self.frames, 'frame')}, {self.pairs} pairs of scenes each"
-        return f"{drawn}; expected correlation with a second measurement: {', '.join(words) or 'unknown'}"
+        sure = "unknown" if self.neutral_reliability is None else f"{self.neutral_reliability:.2f}"
+        return f"{drawn}; expected correlation of the neutral scores with a second measurement: {sure}"
 
 
 RECORDS: dict[str, type] = {
@@ -286,10 +269,8 @@ RECORDS: dict[str, type] = {
     "score": DeletionScores,
     "control": UntrainedMaps,
     "faithfulness": Faithfulness,
-    "randomisation": MapQuality,
     "map-quality": MapQuality,
     "truth": Truth,
-    "timing": MapQuality,
 }
 """Record of each step of a study."""
 TABLES = {
@@ -297,18 +278,14 @@ TABLES = {
     "explain": "explanations",
     "score": "deletion",
     "faithfulness": "faithfulness",
-    "randomisation": "randomisation",
     "map-quality": "map_quality",
     "truth": "truth",
-    "timing": "timing",
 }
 """Field of `Study` with the records of each step, one a network."""
 CONFIG_FILE = "study.json"
 """File of a study's folder that holds its `StudyConfig`."""
-TESTS = ("score", "faithfulness", "randomisation", "map-quality", "truth", "timing")
-"""Steps that a study may leave out: the thesis's score, removal curves, new weights, ..."""
-DEFAULT_TESTS = ("score", "faithfulness", "map-quality", "truth")
-"""Steps of a study that asks for none: new weights and exact timing take long and change no verdict."""
+TESTS = ("score", "faithfulness", "map-quality", "truth")
+"""Steps that a study may leave out: the thesis's score, removal curves, looks of the maps, the truth."""
 STUDY_METHODS = (
     "grad-cam-thesis",
     "integrated-gradients-thesis",
@@ -377,14 +354,8 @@ class StudyConfig:
     """Number of trials; where too few qualify, those within 5 points are taken too."""
     tolerance: float = 0.03
     """Largest error of a prediction in a trial that qualifies, in margin units."""
-    tests: tuple[str, ...] = DEFAULT_TESTS
-    """Some of `TESTS`; `randomisation` and `timing` only where they are named."""
-    settings: tuple[Setting, ...] = SETTINGS
-    """Fills and units of the removal curves."""
-    random_orders: int = 10
-    """Random orders that every method has to beat."""
-    steps: int | None = None
-    """Steps of the thesis's deletion score; the rows of pixels, as in the thesis, if None."""
+    tests: tuple[str, ...] = TESTS
+    """Some of `TESTS`."""
     seed: int = 0
     """Seed of random orders, new weights and noise."""
     quick: bool = False
@@ -405,10 +376,8 @@ class Study(Result):
     explanations: dict[str, Explanation] = field(default_factory=dict)
     deletion: dict[str, DeletionScores] = field(default_factory=dict)
     faithfulness: dict[str, Faithfulness] = field(default_factory=dict)
-    randomisation: dict[str, MapQuality] = field(default_factory=dict)
     map_quality: dict[str, MapQuality] = field(default_factory=dict)
     truth: dict[str, Truth] = field(default_factory=dict)
-    timing: dict[str, MapQuality] = field(default_factory=dict)
 
     @property
     def summary(self) -> str:
@@ -434,9 +403,7 @@ class Study(Result):
     @property
     def source(self) -> str:
         """Where the study's frames come from: "simulated" or "real"."""
-        if self.choice is not None:
-            return self.choice.source
-        return next((test.source for test in self._tests), "simulated")
+        return next((record.source for record in (self.choice, *self._tests) if record), "simulated")
 
     @property
     def left_out(self) -> dict[str, str]:
@@ -461,5 +428,5 @@ class Study(Result):
 
     @property
     def _tests(self) -> list[OfNetwork]:
-        tables = self.faithfulness, self.randomisation, self.map_quality, self.timing, self.truth
+        tables = self.faithfulness, self.map_quality, self.truth
         return [record for table in tables for record in table.values()]

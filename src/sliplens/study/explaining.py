@@ -38,14 +38,7 @@ from sliplens.images import Images, as_frames, read_image
 from sliplens.models import Network
 from sliplens.models.wrapping import Preprocess, open_run
 from sliplens.plots.saliency import draw_explanation
-from sliplens.progress import (
-    OnProgress,
-    add_note,
-    ignore,
-    number_of,
-    open_stage,
-    reporting,
-)
+from sliplens.progress import OnProgress, add_note, ignore, number_of, open_stage, reporting
 from sliplens.recordings import Dataset, Recording, load_dataset
 from sliplens.recordings.dataset import DATASET_FILE
 from sliplens.recordings.sensor import SensorProfile, load_profile

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -23,31 +24,13 @@ from sliplens.files import DEFAULT_NETWORK, hash_json, scratch_folder
 from sliplens.intervals import FEWEST_UNITS
 from sliplens.models import Network
 from sliplens.models.wrapping import open_run
-from sliplens.progress import (
-    OnProgress,
-    add_note,
-    current_listener,
-    number_of,
-    open_stage,
-    reporting,
-)
+from sliplens.progress import OnProgress, add_note, current_listener, number_of, open_stage, reporting
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.results.explanation import Explanation, Strip
 from sliplens.results.faithfulness import NEW_WEIGHTS, RemovalCurve
-from sliplens.results.study import (
-    CONFIG_FILE,
-    QUICK_METHODS,
-    RECORDS,
-    SETTINGS,
-    TABLES,
-    TESTS,
-    Setting,
-    Study,
-    StudyConfig,
-)
+from sliplens.results.study import CONFIG_FILE, QUICK_METHODS, RECORDS, SETTINGS, TABLES, TESTS, Study, StudyConfig
 from sliplens.runner import MakePart, Work, require_executor
 from sliplens.simulation.intervention import rebuild_trial
-from sliplens.study.checks import Untrained, measure_maps, randomise_weights, time_explainers
 from sliplens.study.choice import (
     LEVELS,
     SCORED_LEVELS,
@@ -62,9 +45,9 @@ from sliplens.study.choice import (
     worth_scoring,
 )
 from sliplens.study.explaining import Explaining, make_strip
-from sliplens.study.scoring import Influence, PixelDeletion, Removal
+from sliplens.study.scoring import STUDY_AREAS, STUDY_ORDERS, Influence, PixelDeletion, Removal, Untrained, measure_maps
 from sliplens.study.stages import Stage, keep_record
-from sliplens.study.truth import TRUE_FILL, JudgingByTruth, true_curves
+from sliplens.study.truth import JudgingByTruth, true_curves
 from sliplens.training.evaluation import evaluate
 
 NetworkLike: TypeAlias = Network | nn.Module | Path | str
@@ -84,8 +67,8 @@ def run_study(
     """Find out which explanation of a network can be believed: the experiment of the thesis, and controls it lacks.
 
     Evaluates the networks on the test trials, chooses trials on which they predict well, explains frames from full
-    stick to full slip, scores the explanations by removal under several fills against controls, by randomisation and,
-    where the data are simulated, by the truth (docs/study.md).
+    stick to full slip, scores the explanations by removal under several fills against controls, and, where the data are
+    simulated, by the truth.
     Every step is a folder that is complete or absent: interrupted, the same call goes on where it stopped.
 
     Parameters
@@ -128,8 +111,6 @@ def run_study(
     >>> page = sl.write_report(study)  # doctest: +SKIP
     """
     config = config or StudyConfig()
-    if config.random_orders < 1:
-        raise InputError(f"{config.random_orders} random orders are too few; --random-orders must be at least 1")
     if unknown := sorted(set(config.tests) - set(TESTS)):
         raise InputError(f"a study has no test named {unknown[0]!r}; choose from {', '.join(TESTS)}")
     require_executor(on)
@@ -156,22 +137,17 @@ def run_study(
             for name, run in records.networks.items()
         }
         of_networks = [replace(records, network=name) for name in records.networks]
-        steps = _required_steps(config.tests)
-        for step in (step for step in steps if step.shared):
+        for step in SHARED:
             _run_step(step, records)
         save_record(config, records.folder / CONFIG_FILE)
-        if records.not_redrawn:
-            if data.simulated and "truth" in config.tests:
+        steps = [step for step in _required_steps(config.tests) if step not in SHARED]
+        if records.not_redrawn and "truth" in steps:
+            steps.remove("truth")
+            if data.simulated:
                 add_note(f"the truth is left out, since {records.not_redrawn}")
-            steps = [step for step in steps if step.name != "truth"]
-        for of_network in of_networks:
-            for step in (step for step in steps if not step.shared):
-                _run_step(step, of_network)
-        tables = {
-            TABLES[step.name]: {each.network: each[step.name] for each in of_networks}
-            for step in steps
-            if step.name in TABLES
-        }
+        for of_network, step in product(of_networks, steps):
+            _run_step(step, of_network)
+        tables = {TABLES[step]: {each.network: each[step] for each in of_networks} for step in steps if step in TABLES}
         study = Study(
             folder=records.folder,
             config=config,
@@ -213,13 +189,13 @@ class Records:
     overwrite: bool = False
     network: str = ""
 
-    def path(self, step: "Step") -> Path:
+    def path(self, step: str) -> Path:
         """Return the folder of a step."""
-        return self.folder / (step.name if step.shared else f"{step.name}-{self.network}")
+        return self.folder / (step if step in SHARED else f"{step}-{self.network}")
 
     def __getitem__(self, name: str) -> Any:
         """Load the record of a step."""
-        return load_result(self.path(_find_step(name)), RECORDS[name], command="sliplens study")
+        return load_result(self.path(name), RECORDS[name], command="sliplens study")
 
     @property
     def run(self) -> Network:
@@ -260,7 +236,7 @@ class Records:
 def _quick(config: StudyConfig, data: Dataset) -> StudyConfig:
     """Shorten a study to the judge that decides; what differs from the defaults stays as it was asked for."""
     default, test = StudyConfig(), "truth" if data.simulated else "faithfulness"
-    short = replace(default, methods=QUICK_METHODS, trials=6, tests=(test,), settings=SETTINGS[:1])
+    short = replace(default, methods=QUICK_METHODS, trials=6, tests=(test,))
     changed = {name for name, value in vars(config).items() if value != getattr(default, name)}
     return replace(config, **{name: value for name, value in vars(short).items() if name not in changed})
 
@@ -278,33 +254,26 @@ def _require_trials(data: Dataset, config: StudyConfig) -> None:
         add_note(f"fewer than {FEWEST_UNITS} trials decide nothing: the page shows maps and no verdict; raise --trials")
 
 
-_PASSES_OF_MAP = {"grad-cam": 8, "integrated-gradients": 250, "poly-cam": 500, "occlusion": 200, "shapley": 300}
-"""Forward passes that a map takes about as long as, by the beginning of the method's name; 100 for others."""
-
-
 def estimate_minutes(records: Records) -> float:
     """Estimate the minutes that the steps take on one core, from a few forward passes; half or twice of it is usual."""
-    config, seconds = records.config, 0.0
+    config, seconds, methods = records.config, 0.0, len(records.config.methods)
     trials = min(config.trials, len(sample_trials(records.data, split=config.split, condition=config.condition)))
     for run in records.networks.values():
-        size, methods = run.manifest.image_size, len(config.methods)
+        size = run.manifest.image_size
         images = torch.zeros(32, run.encoding.colours, size, size, device=run.device)
         run.predict(images)
         started = time.perf_counter()
         run.predict(images)
-        pass_s = (time.perf_counter() - started) / len(images)
-        maps = sum(
-            next((passes for start, passes in _PASSES_OF_MAP.items() if name.startswith(start)), 100)
-            for name in config.methods
-        )
-        of_frame = {
-            "control": maps / 2,
-            "score": (methods + 1) * (config.steps or size),
-            "faithfulness": len(config.settings) * (4 * methods + 10 + config.random_orders) * 7,
+        # passes of a frame by step: a map takes some 200 of them
+        passes = {
+            "explain": 200 * methods * len(LEVELS) / len(SCORED_LEVELS),
+            "control": 100 * methods,
+            "score": (methods + 1) * size,
+            "faithfulness": len(SETTINGS) * (4 * methods + 20) * len(STUDY_AREAS),
             "truth": 3000 if records.data.simulated else 0,
         }
-        scored = sum(of_frame.get(step.name, 0) for step in _required_steps(config.tests))
-        seconds += trials * (len(LEVELS) * maps + len(SCORED_LEVELS) * scored) * pass_s
+        scored = sum(passes.get(step, 0) for step in _required_steps(config.tests))
+        seconds += trials * len(SCORED_LEVELS) * scored * (time.perf_counter() - started) / len(images)
     return seconds / 60
 
 
@@ -336,26 +305,22 @@ def _explain(records: Records) -> Explaining:
 
 
 def _delete(records: Records) -> PixelDeletion:
-    steps, seed = records.config.steps, records.config.seed
-    return PixelDeletion(trained=records.run, explained=records.material.explained, steps=steps, seed=seed)
+    return PixelDeletion(trained=records.run, explained=records.material.explained, seed=records.config.seed)
 
 
 def _remove(records: Records) -> Removal:
-    config = records.config
-
     def put_back(part: Explanation, maps: Influence, seed: int) -> Mapping[str, RemovalCurve]:
-        orders = config.random_orders
-        return true_curves(records.run, part, records.data, maps=maps, random_orders=orders, seed=seed)
+        return true_curves(records.run, part, records.data, maps=maps, random_orders=STUDY_ORDERS, seed=seed)
 
     return Removal(
         trained=records.run,
         explained=records.material.explained,
         units=records.material.units(),
         maps=records.influence,
-        settings=config.settings,
-        random_orders=config.random_orders,
-        further={Setting(fill=TRUE_FILL, unit="marker"): put_back} if not records.not_redrawn else {},
-        seed=config.seed,
+        settings=SETTINGS[:1] if records.config.quick else SETTINGS,
+        random_orders=STUDY_ORDERS,
+        redraw=None if records.not_redrawn else put_back,
+        seed=records.config.seed,
     )
 
 
@@ -379,84 +344,39 @@ def judge_by_truth(records: Records) -> JudgingByTruth:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Step:
     """Step of a study: from records to a record, in a folder of its name."""
 
-    name: str
     title: str
     make: Callable[[Records], Any]
     """Makes the record, or a `Stage` whose parts workers share."""
-    needs: tuple[str, ...] = ("explain",)
-    """Steps whose records it takes."""
-    shared: bool = False
-    """True where one record is of all networks."""
-
-    def config(self, records: Records) -> object:
-        """Return all that the record depends on: a folder with another configuration is not reused."""
-        weights = {name: run.manifest.weights_sha256 for name, run in records.networks.items()}
-        config = vars(records.config) | {"tests": (), "data_hash": records.data.hash, "weights_sha256": weights}
-        if self.shared:
-            return config
-        return config | {"weights_sha256": weights[records.network], "choice": hash_json(records["choice"])}
 
 
-STUDY = (
-    Step(
-        name="choice",
-        title="Choosing trials",
-        make=lambda records: choose_frames(records.networks, records.data, records.config),
-        needs=(),
-        shared=True,
+SHARED: dict[str, Step] = {
+    "choice": Step("Choosing trials", lambda records: choose_frames(records.networks, records.data, records.config)),
+    "states": Step("Following markers", lambda records: show_states(records["choice"], records.data)),
+    "strip": Step("Explaining a trial from stick to slip", _show_trial),
+}
+"""Steps whose record is of all networks."""
+STUDY: dict[str, Step] = {
+    **SHARED,
+    "explain": Step(Explaining.title, _explain),
+    "score": Step(PixelDeletion.title, _delete),
+    "control": Step(Untrained.title, lambda records: Untrained(material=records.material, seed=records.config.seed)),
+    "faithfulness": Step(Removal.title, _remove),
+    "map-quality": Step(
+        "Measuring how maps look", lambda records: measure_maps(records.material, seed=records.config.seed)
     ),
-    Step(
-        name="states",
-        title="Following markers",
-        make=lambda records: show_states(records["choice"], records.data),
-        needs=("choice",),
-        shared=True,
-    ),
-    Step(
-        name="strip",
-        title="Explaining a trial from stick to slip",
-        make=_show_trial,
-        needs=("choice",),
-        shared=True,
-    ),
-    Step(name="explain", title=Explaining.title, make=_explain, needs=("choice", "states")),
-    Step(name="score", title=PixelDeletion.title, make=_delete),
-    Step(
-        name="control",
-        title=Untrained.title,
-        make=lambda records: Untrained(material=records.material, seed=records.config.seed),
-    ),
-    Step(name="faithfulness", title=Removal.title, make=_remove, needs=("explain", "control")),
-    Step(
-        name="randomisation",
-        title="Drawing weights anew, layer by layer",
-        make=lambda records: randomise_weights(records.material, seed=records.config.seed),
-    ),
-    Step(
-        name="map-quality",
-        title="Measuring how maps look",
-        make=lambda records: measure_maps(records.material, seed=records.config.seed),
-    ),
-    Step(name="truth", title=JudgingByTruth.title, make=judge_by_truth, needs=("explain", "control")),
-    Step(name="timing", title="Timing the methods", make=lambda records: time_explainers(records.material)),
-)
+    "truth": Step(JudgingByTruth.title, judge_by_truth),
+}
 """Steps of a study in their order."""
 
 
-def _find_step(name: str) -> Step:
-    return next(step for step in STUDY if step.name == name)
-
-
-def _required_steps(tests: Sequence[str]) -> list[Step]:
-    """Return the steps of some tests, those that they need among them; frames are explained in any case."""
-    needed = {"strip", "explain", *tests}
-    for step in reversed(STUDY):
-        needed |= set(step.needs) if step.name in needed else set()
-    return [step for step in STUDY if step.name in needed]
+def _required_steps(tests: Sequence[str]) -> list[str]:
+    """Return the steps of some tests, the controls where they need them; frames are explained in any case."""
+    needed = {*SHARED, "explain", *tests} | ({"control"} if {"faithfulness", "truth"} & set(tests) else set())
+    return [name for name in STUDY if name in needed]
 
 
 class _StepWork(Work):
@@ -475,23 +395,27 @@ class _StepWork(Work):
 
     def begin(self) -> MakePart:
         """Open the step."""
-        return _find_step(self.name).make(self.records).begin()
+        return STUDY[self.name].make(self.records).begin()
 
 
-def _run_step(step: Step, records: Records) -> None:
-    """Keep the record of a step, unless its folder is complete."""
-    folder = records.path(step)
-    title = step.title if step.shared else f"{step.title} ({records.network})"
+def _run_step(name: str, records: Records) -> None:
+    """Keep the record of a step, unless its folder is complete; one of another configuration is not reused."""
+    folder, step = records.path(name), STUDY[name]
+    weights: Any = {each: run.manifest.weights_sha256 for each, run in records.networks.items()}
+    config = vars(records.config) | {"tests": (), "data_hash": records.data.hash, "weights_sha256": weights}
+    title = step.title
+    if records.network:
+        config |= {"weights_sha256": weights[records.network], "choice": hash_json(records["choice"])}
+        title = f"{step.title} ({records.network})"
 
     def make(parts: Path) -> Any:
         with open_stage(title):
             record = step.make(records)
             if isinstance(record, Stage):
-                work = _StepWork(step.name, records)
-                record = record.make(parts, work=work, on=records.on)
+                record = record.make(parts, work=_StepWork(name, records), on=records.on)
         if alarms := getattr(record, "alarms", ()):
             add_note(f"{folder.name}: {number_of(len(alarms), 'alarm')}, such as: {alarms[0]}")
         return record
 
     what = title[0].lower() + title[1:]
-    keep_record(folder, make, stage=step.name, config=step.config(records), what=what, overwrite=records.overwrite)
+    keep_record(folder, make, stage=name, config=config, what=what, overwrite=records.overwrite)

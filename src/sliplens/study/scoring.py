@@ -1,54 +1,59 @@
-"""Public call that scores explanations, and its two stages: removal, and the thesis's deletion."""
+"""Public call that scores explanations, its two stages, and maps of networks with new weights."""
 
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from contextlib import suppress
+from dataclasses import dataclass, fields, replace
+from itertools import combinations, product
 from pathlib import Path
 from typing import Literal, TypeAlias, Unpack
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from torch import nn
+from torch import Tensor, nn
 
 from sliplens.codec import load_result
-from sliplens.errors import InputError, SaliencyError
+from sliplens.errors import InputError, ModelError, SaliencyError
+from sliplens.explainers.contract import Explainer
 from sliplens.explainers.explain import network_inputs, network_references
+from sliplens.explainers.gradients import IntegratedGradients
 from sliplens.explainers.occlusion import tile_regions
+from sliplens.explainers.poly_cam import PolyCam
+from sliplens.explainers.shapley import Shapley
+from sliplens.faithfulness import scoring
+from sliplens.faithfulness.controls import (
+    cascade,
+    even_channels,
+    infidelity,
+    max_sensitivity,
+    resolution,
+    total_variation,
+)
 from sliplens.faithfulness.fills import get_fill
 from sliplens.faithfulness.removal import AREAS, RANDOM_ORDERS, Units, answer_whole, score_maps
-from sliplens.faithfulness.scoring import (
-    SettingCurves,
-    delete_pixels,
-    deletion_orders,
-    deletion_steps,
-    explanation_of_maps,
-    influences,
-    prepare_passes,
-    require_same_network,
-    score_curves,
-    score_deletion,
-)
+from sliplens.intervals import paired_difference
 from sliplens.models import Network
 from sliplens.models.wrapping import open_run
 from sliplens.progress import open_stage, report_each, reporting
 from sliplens.results.explanation import Explanation, load_explanation
-from sliplens.results.faithfulness import Deletion, DeletionScores, Faithfulness, RemovalCurve
-from sliplens.results.study import SETTINGS, Setting
+from sliplens.results.faithfulness import NEW_WEIGHTS, Deletion, DeletionScores, Faithfulness, MethodGap, RemovalCurve
+from sliplens.results.study import SETTINGS, MapMeasures, MapQuality, Setting, UntrainedMaps
 from sliplens.runner import Part
-from sliplens.study.choice import trial_seed
+from sliplens.study.choice import Material, trial_seed
 from sliplens.study.explaining import Running
-from sliplens.study.stages import MakeRecord, Stage, TrialArrays, join_trials, keep_record, trial_parts
+from sliplens.study.stages import MakeRecord, Stage, TrialArrays, join_trials, keep_record, mean_of_known, trial_parts
 
 STEPS = 28
 """An eighth of the thesis's 224: the mean over the steps differs from that over all of them by less than a step."""
 STUDY_AREAS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)
 """Fewer shares than `AREAS`, so that many settings can be scored: enough for trapezoids."""
+STUDY_ORDERS = 10
+"""Random orders that every method of a study has to beat."""
 _TILES_ACROSS = 14
+REDRAWN = Setting(fill="true", unit="marker")
 Influence: TypeAlias = Mapping[str, Float[np.ndarray, "images height width"]]
 """Maps that rank parts, of each method and control."""
-Scoring: TypeAlias = Callable[[Explanation, Influence, int], Mapping[str, RemovalCurve]]
-"""Function from explained frames, their maps and a seed to their curves."""
 
 
 def score(
@@ -134,13 +139,13 @@ def score(
         raise InputError(f"{random_orders} random orders are too few; --random-orders must be at least 1")
     network = open_run(run, device=running.get("device", "cpu"), preprocess=running.get("preprocess"))
     explanation = _to_score(network, frames, maps, reference, signed=signed)
-    require_same_network(network, explanation)
+    scoring.require_same_network(network, explanation)
     shape = (explanation.image_size, explanation.image_size)
     units = tile_regions(shape, tile_px=1 if unit == "pixel" else max(1, shape[0] // _TILES_ACROSS)).numpy()
     removal = Removal(
         trained=network,
         explained=explanation,
-        maps=influences(network, explanation),
+        maps=scoring.influences(network, explanation),
         units={unit: [units] * len(explanation.frames)},
         settings=(Setting(fill=fill, unit=unit),),
         areas=AREAS,
@@ -193,7 +198,7 @@ def _to_score(
     if maps is None:
         raise InputError("the frames have no maps to score; give an explanation of them, or an array of maps")
     if isinstance(maps, np.ndarray):
-        return explanation_of_maps(network, frames, maps, reference, signed=signed)
+        return scoring.explanation_of_maps(network, frames, maps, reference, signed=signed)
     if len(maps.frames) != len(frames):
         raise SaliencyError(
             f"there are {len(maps.frames)} maps of {len(frames)} frames; explain the frames that are scored"
@@ -203,12 +208,9 @@ def _to_score(
 
 @dataclass(frozen=True, kw_only=True)
 class Removal(Stage[Faithfulness]):
-    """Removal of parts in the order of every map, under each setting; a part is a setting and a trial.
+    """Removal of parts in the order of every map, under each setting; a part is a setting and a trial."""
 
-    Curves that are computed in another way, such as by drawing the scene anew (`further`), are scored with the others.
-    """
-
-    record = SettingCurves
+    record = scoring.SettingCurves
     title = "Removing parts"
 
     trained: Network
@@ -220,7 +222,8 @@ class Removal(Stage[Faithfulness]):
     settings: Sequence[Setting] = SETTINGS
     areas: Sequence[float] = STUDY_AREAS
     random_orders: int = RANDOM_ORDERS
-    further: Mapping[Setting, Scoring] = field(default_factory=dict)
+    redraw: Callable[[Explanation, Influence, int], Mapping[str, RemovalCurve]] | None = None
+    """Curves under the true fill, by drawing the scene anew; None where it cannot be."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -229,7 +232,8 @@ class Removal(Stage[Faithfulness]):
 
     @property
     def _all_settings(self) -> list[Setting]:
-        return [*(setting for setting in self.settings if setting.unit in self.units), *self.further]
+        settings = [setting for setting in self.settings if setting.unit in self.units]
+        return settings if self.redraw is None else [*settings, REDRAWN]
 
     def parts(self) -> Iterator[Part]:
         """Yield all trials under the first setting, then under the next."""
@@ -240,16 +244,16 @@ class Removal(Stage[Faithfulness]):
         """Return the function that computes the curves of a trial under one setting."""
         inputs, orders = network_inputs(self.trained, self.explained), 2 * len(self.maps) + self.random_orders
         references = network_references(self.trained, self.explained)
-        passes = (len(self._all_settings) - len(self.further)) * len(inputs) * orders * (len(self.areas) - 2)
-        predict, trials = prepare_passes(self.trained, inputs, passes), list(self.explained.trials)
+        passes = len(self.settings) * len(inputs) * orders * (len(self.areas) - 2)
+        predict, trials = scoring.prepare_passes(self.trained, inputs, passes), list(self.explained.trials)
 
-        def remove_parts(item: tuple[str, str, str]) -> SettingCurves:
+        def remove_parts(item: tuple[str, str, str]) -> scoring.SettingCurves:
             fill, unit, trial = item
             setting, rows = Setting(fill=fill, unit=unit), self.explained.trials[trial]
             part, maps = self.explained.take(rows), {name: values[rows] for name, values in self.maps.items()}
             images, empty, seed = inputs[rows], references[rows], trial_seed(self.seed, trials.index(trial))
-            if setting in self.further:
-                curves, blank = self.further[setting](part, maps, seed), np.full(len(rows), np.nan)
+            if setting == REDRAWN and self.redraw is not None:
+                curves, blank = self.redraw(part, maps, seed), np.full(len(rows), np.nan)
             else:
                 paint = get_fill(fill)(images, empty, seed)
                 gone = torch.ones((len(images), *images.shape[-2:]), dtype=torch.bool, device=images.device)
@@ -269,7 +273,7 @@ class Removal(Stage[Faithfulness]):
                     areas=self.areas,
                     seed=seed,
                 )
-            return SettingCurves(
+            return scoring.SettingCurves(
                 areas=next(iter(curves.values())).areas,
                 curves={
                     name: np.stack([curve.most_first, curve.least_first, curve.random])
@@ -281,19 +285,19 @@ class Removal(Stage[Faithfulness]):
 
         return remove_parts
 
-    def join(self, records: Sequence[SettingCurves]) -> Faithfulness:
+    def join(self, records: Sequence[scoring.SettingCurves]) -> Faithfulness:
         """Score all curves."""
         count = len(self.explained.trials)
         curves = {}
         for at, setting in enumerate(self._all_settings):
             parts = records[at * count : (at + 1) * count]
             answers = [{"whole": part.whole, "blank": part.blank} for part in parts]
-            curves[setting] = SettingCurves(
+            curves[setting] = scoring.SettingCurves(
                 areas=parts[0].areas,
                 curves=join_trials(self.explained, [part.curves for part in parts], axis=1),
                 **join_trials(self.explained, answers),
             )
-        return score_curves(self.explained, curves, random_orders=self.random_orders, seed=self.seed)
+        return scoring.score_curves(self.explained, curves, random_orders=self.random_orders, seed=self.seed)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -316,14 +320,15 @@ class PixelDeletion(Stage[DeletionScores]):
 
     def prepare(self) -> MakeRecord:
         """Return the function that deletes the pixels of the frames of a trial."""
-        inputs, orders = network_inputs(self.trained, self.explained), deletion_orders(self.explained, seed=self.seed)
-        removed = deletion_steps((self.explained.image_size, self.explained.image_size), steps=self.steps)
-        predict = prepare_passes(self.trained, inputs, len(orders) * len(inputs) * len(removed))
+        inputs, size = network_inputs(self.trained, self.explained), self.explained.image_size
+        orders = scoring.deletion_orders(self.explained, seed=self.seed)
+        removed = scoring.deletion_steps((size, size), steps=self.steps)
+        predict = scoring.prepare_passes(self.trained, inputs, len(orders) * len(inputs) * len(removed))
 
         def delete(item: tuple[str]) -> TrialArrays:
             rows = self.explained.trials[item[-1]]
             answers = {
-                name: delete_pixels(predict, inputs[rows], orders[name][rows], fill=self.fill, steps=self.steps)
+                name: scoring.delete_pixels(predict, inputs[rows], orders[name][rows], fill=self.fill, steps=self.steps)
                 for name in report_each(list(orders), sizes=[len(rows)] * len(orders))
             }
             return TrialArrays(arrays=answers)
@@ -333,4 +338,109 @@ class PixelDeletion(Stage[DeletionScores]):
     def join(self, records: Sequence[TrialArrays]) -> DeletionScores:
         """Score all curves."""
         answers = join_trials(self.explained, [record.arrays for record in records])
-        return score_deletion(self.explained, answers, fill=self.fill)
+        return scoring.score_deletion(self.explained, answers, fill=self.fill)
+
+
+_FEW_CHANNELS, _FEW_PAIRS = 0.05, 100
+_FEW_FRAMES = 2  # on which infidelity and sensitivity are measured
+
+
+def measure_maps(material: Material, *, seed: int = 0) -> MapQuality:
+    """Measure resolution, smoothness, infidelity and sensitivity of the maps, and compare the methods' smoothness."""
+    explained, rng, model = material.explained, np.random.default_rng(seed), material.trained.model
+    few, compared = material.inputs[:_FEW_FRAMES], material.references[:_FEW_FRAMES]
+    measures, roughness = {}, {}
+    for method in report_each(list(material.explainers)):
+        maps = explained.saliency[method].astype(np.float64)
+        resolutions = [
+            resolution(saliency, material.places(frame.id)[0])
+            for saliency, frame in zip(maps, explained.frames, strict=True)
+            if frame.id in material.markers
+        ]
+        roughness[method] = np.array([total_variation(saliency) for saliency in maps])
+        explainer = _shortened(material.explainers[method])
+
+        def explain(images: Tensor, explainer: Explainer = explainer) -> Tensor:
+            references = compared.repeat_interleave(len(images) // len(compared), dim=0)
+            return explainer(model, images, reference=references).relevance
+
+        relevance = torch.from_numpy(explained.relevance[method][:_FEW_FRAMES])
+        errors = infidelity(lambda images: model(images).flatten(), few, compared, relevance)
+        measures[method] = MapMeasures(
+            resolution=mean_of_known(np.array(resolutions, dtype=np.float64)),
+            total_variation=mean_of_known(roughness[method]),
+            infidelity=mean_of_known(errors),
+            max_sensitivity=mean_of_known(max_sensitivity(explain, few)),
+        )
+    return MapQuality(
+        input=explained.input,
+        source=explained.source,
+        frames=len(explained.frames),
+        methods=measures,
+        comparisons=tuple(
+            MethodGap(
+                first=first,
+                second=second,
+                gap=paired_difference(roughness[first], roughness[second], clusters=explained.clusters, rng=rng),
+            )
+            for first, second in combinations(roughness, 2)
+        ),
+    )
+
+
+def _shortened(explainer: Explainer) -> Explainer:
+    """Spare passes that a map of new weights does not need: few channels or pairs, no checks."""
+    if isinstance(explainer, PolyCam):
+        return replace(explainer, likeness=None, budget=min(explainer.budget, _FEW_CHANNELS))
+    if isinstance(explainer, IntegratedGradients):
+        return replace(explainer, max_steps=explainer.steps)
+    return replace(explainer, pairs=_FEW_PAIRS) if isinstance(explainer, Shapley) else explainer
+
+
+@dataclass(frozen=True, kw_only=True)
+class Untrained(Stage[UntrainedMaps]):
+    """Maps of networks with all weights drawn anew by each method: controls that every map has to beat.
+
+    Each trial, a part, has a network of its own, so that resampled trials tell what the draw of the weights matters
+    too. Poly-CAM measures 5 % of the channels here and has no likeness, Shapley values draw 100 pairs of coalitions.
+    """
+
+    record = TrialArrays
+    title = "Explaining networks with new weights"
+
+    material: Material
+    seed: int = 0
+
+    @property
+    def trained(self) -> Network:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Network that was explained."""
+        return self.material.trained
+
+    def parts(self) -> Iterator[Part]:
+        """Yield the trials, whose maps are counted."""
+        return trial_parts(self.material.explained, maps=len(self.material.explainers))
+
+    def prepare(self) -> MakeRecord:
+        """Return the function that explains the frames of a trial with its network."""
+        material, inputs, references = self.material, self.material.inputs, self.material.references
+        controls = {name: _shortened(explainer) for name, explainer in material.explainers.items()}
+        trials = material.explained.trials
+
+        def explain(item: tuple[str]) -> TrialArrays:
+            frames, seed = trials[item[-1]], trial_seed(self.seed, list(trials).index(item[-1]))
+            ((_, model),) = cascade(material.trained.model, seed=seed, stages=1, images=inputs)
+            maps: dict[str, list[np.ndarray]] = {}
+            with suppress(ModelError):  # without layers that have a map
+                maps["weights-1"] = list(even_channels(model, inputs[frames], references[frames]).cpu().numpy())
+            for name, frame in report_each(list(product(material.explainers, frames))):
+                attribution = controls[name](model, inputs[frame, None], reference=references[frame, None])
+                maps.setdefault(name, []).append(attribution.influence[0].float().cpu().numpy())
+            return TrialArrays(arrays={name + NEW_WEIGHTS: np.stack(rows) for name, rows in maps.items()})
+
+        return explain
+
+    def join(self, records: Sequence[TrialArrays]) -> UntrainedMaps:
+        """Join the maps of all frames."""
+        explained = self.material.explained
+        maps = join_trials(explained, [record.arrays for record in records])
+        return UntrainedMaps(input=explained.input, source=explained.source, maps=maps)

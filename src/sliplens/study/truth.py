@@ -14,21 +14,10 @@ from sliplens.explainers.attribution import change_of
 from sliplens.explainers.explain import network_inputs, network_references
 from sliplens.explainers.occlusion import marker_regions
 from sliplens.explainers.shapley import shapley_values
+from sliplens.faithfulness import removal
 from sliplens.faithfulness.controls import lead_over_controls, relevance_mass
 from sliplens.faithfulness.fills import get_fill
-from sliplens.faithfulness.removal import (
-    RANDOM_ORDERS,
-    SHARES,
-    Redraw,
-    Units,
-    answer_scenes,
-    influence_orders,
-    marker_curves,
-    removal_curves,
-    score_maps_by_marker,
-    unit_means,
-    unit_order,
-)
+from sliplens.faithfulness.removal import SHARES, Redraw
 from sliplens.faithfulness.scoring import prepare_passes, require_same_network
 from sliplens.intervals import Difference, mean_interval, paired_difference
 from sliplens.models import Network
@@ -38,13 +27,7 @@ from sliplens.results.explanation import ExplainedFrame, Explanation
 from sliplens.results.faithfulness import CHANCE, RemovalCurve, is_control
 from sliplens.results.study import Localisation, MarkerEffects, MetaTest, NeutralScores, Truth
 from sliplens.runner import Part, part
-from sliplens.simulation.intervention import (
-    FilmedTrial,
-    marker_readings,
-    put_markers_back,
-    rebuild_trial,
-    visible_markers,
-)
+from sliplens.simulation.intervention import FilmedTrial, put_markers_back, rebuild_trial, visible_markers
 from sliplens.study.neutral import (
     GROUPS,
     correlate_groups,
@@ -73,7 +56,7 @@ class StagedFrame:
     reference: UInt8[np.ndarray, "rows columns 3"]
     markers: Int[np.ndarray, " markers"]
     """Numbers of the markers that lie wholly in the image: those cut by its border stay as they are."""
-    units: Units
+    units: removal.Units
     """For each pixel which of the `markers` covers it, where it is or where the baseline has it, its rim included: its
     place among them, or their number where there is none."""
     edges: Bool[np.ndarray, "size size"]
@@ -157,12 +140,10 @@ def redrawing(trained: Network, frames: Sequence[StagedFrame], *, to: Sequence[i
 
 TRUE_FILL = "true"
 ORACLE, DEGRADED = "oracle", "degraded-oracle"
-TRUTH_FILLS = ("reference", "grey", "background", "blur")
-"""Fills that the oracle is tried under; the true one always is. The noisy-linear one takes longer than all of them."""
 TRUTH_PAIRS = 200
 """Pairs of scenes for the Shapley values of a frame: their standard error is then about a third of their spread."""
 
-_EFFECTS = ("stick", "shapley", "network", "margin")
+_EFFECTS = ("stick", "shapley")
 """Effects that a map is compared with, as `MarkerEffects` and `Localisation` name it."""
 
 Maps = Float[np.ndarray, "frames size size"]
@@ -174,8 +155,6 @@ class FrameEffects:
 
     shapley: Float64[np.ndarray, " markers"]
     shapley_error: Float64[np.ndarray, " markers"]
-    network: Float64[np.ndarray, " markers"]
-    margin: Float64[np.ndarray, " markers"]
     stick: Float64[np.ndarray, " markers"]
     groups: Int64[np.ndarray, "groups members"]
     """Places of the members among the frame's markers."""
@@ -203,7 +182,7 @@ def shuffle_half(values: Float[np.ndarray, " markers"], *, rng: np.random.Genera
 def marker_means(maps: Maps, frames: Sequence[StagedFrame]) -> list[Float[np.ndarray, " markers"]]:
     """Mean of each frame's map over each of its markers, where it is and where it was."""
     return [
-        unit_means(values.astype(np.float64), frame.units)[: len(frame.markers)]
+        removal.unit_means(values.astype(np.float64), frame.units)[: len(frame.markers)]
         for values, frame in zip(maps, frames, strict=True)
     ]
 
@@ -231,10 +210,9 @@ def mean_of_defined(
     return mean_interval(values[valid], clusters=clusters[:, valid], rng=rng, limits=limits)
 
 
-_Interval = Callable[[Iterable[float]], Difference | None]
-
-
-def meta_test(effects: Sequence[FrameEffects], interval: _Interval) -> tuple[MetaTest, ...]:
+def meta_test(
+    effects: Sequence[FrameEffects], interval: Callable[[Iterable[float]], Difference | None]
+) -> tuple[MetaTest, ...]:
     """Test whether each fill ranks the map of all effects above the one of which half is shuffled."""
     tests = []
     for fill in effects[0].gains:
@@ -245,20 +223,14 @@ def meta_test(effects: Sequence[FrameEffects], interval: _Interval) -> tuple[Met
     return tuple(tests)
 
 
-def reliability_of(values: Float64[np.ndarray, " markers"], errors: Float64[np.ndarray, " markers"]) -> float:
-    """Part of the spread of a frame's Shapley values that is no sampling error; NaN where they do not vary."""
-    spread = float(values.var(ddof=1)) if len(values) > 1 else 0.0
-    return float("nan") if spread == 0 else max(0.0, 1 - float((errors**2).mean()) / spread)
-
-
 @dataclass(frozen=True, kw_only=True)
 class JudgingByTruth(Stage[Truth]):
-    """Markers of every frame, a part, put back alone and in company, and maps compared with what that does.
+    """Markers of every frame, a part, put back or moved, and maps compared with what that does.
 
     The main judge is neutral: no map is made to predict how groups of markers, moved to another margin of the trial,
     change the prediction. Beside it, marker by marker, the mean of a map is compared with Shapley values of the stick
-    game, those of the untouched game, and the change by putting a marker back alone. All are signed, along the change
-    of the prediction, which leaves correlations of methods as they are. A control knows no sign: it has the one that
+    game and of the untouched game. All are signed, along the change of the prediction, which leaves correlations of
+    methods as they are. A control knows no sign: it has the one that
     suits it where leads are taken.
     """
 
@@ -270,7 +242,7 @@ class JudgingByTruth(Stage[Truth]):
     data: Dataset
     maps: Mapping[str, Maps]
     """Influences by method, controls included."""
-    fills: Sequence[str] = TRUTH_FILLS
+    fills: Sequence[str] = ()
     """Those under which a map that knows the effects is compared with one that knows half of them."""
     pairs: int = TRUTH_PAIRS
     """Number of pairs of scenes behind the Shapley values of a frame and game; at least two a marker are taken."""
@@ -299,37 +271,38 @@ class JudgingByTruth(Stage[Truth]):
         put_to_baseline = redrawing(trained, frames, to=[frame.explained.baseline_frame for frame in frames])
         move = redrawing(trained, frames, to=[frame.neutral_frame for frame in frames])
         references = network_references(trained, explained).to(trained.device)
-        # groups, each marker alone, pairs of scenes of two games, and under each fill three maps both ways
-        passes = len(frames) * (GROUPS + len(frames[0].markers) + 4 * pairs + 6 * len(SHARES) * (len(fills) + 1))
+        # groups, pairs of scenes of two games, and under each fill three maps both ways
+        passes = len(frames) * (GROUPS + 4 * pairs + 6 * len(SHARES) * (len(fills) + 1))
         predict = prepare_passes(trained, inputs, passes)
 
         def put_back(index: int) -> FrameEffects:
             frame, towards = frames[index], float(explained.towards[index])
-            count, answer = len(frame.markers), answer_scenes(predict, partial(redraw, index))
+            count, answer = len(frame.markers), removal.answer_scenes(predict, partial(redraw, index))
             groups = draw_groups(count, rng=np.random.default_rng((seed, index, GROUPS)))
             # the whole image first
             members = np.zeros((len(groups) + 1, count), dtype=bool)
             np.put_along_axis(members[1:], groups, values=True, axis=1)
-            moved = answer_scenes(predict, partial(move, index))(members)
-            answers = answer(np.eye(count + 1, count, k=-1, dtype=bool))
+            moved = removal.answer_scenes(predict, partial(move, index))(members)
             # a run that goes on draws the same; a first guess would lean the truth towards the map that gave it
             rng = np.random.default_rng((seed, index))
             estimate = shapley_values(lambda stay: answer(~stay), count, pairs=pairs, rng=rng)
             stick, values = np.full(count, np.nan), estimate.values
             if frame.explained.baseline_frame is not None:
-                of_stick = answer_scenes(predict, partial(put_to_baseline, index))
+                of_stick = removal.answer_scenes(predict, partial(put_to_baseline, index))
                 stick = values = shapley_values(lambda stay: of_stick(~stay), count, pairs=pairs, rng=rng).values
             shuffled = shuffle_half(values, rng=rng)
-            change = unit_means(change_of(inputs[index], references[index]).cpu().double().numpy(), frame.units)[:count]
+            change = removal.unit_means(
+                change_of(inputs[index], references[index]).cpu().double().numpy(), frame.units
+            )[:count]
             maps = [towards * values, towards * shuffled, change]
             orders = [
-                unit_order(frame.paint(values), frame.units, least_first=least)
+                removal.unit_order(frame.paint(values), frame.units, least_first=least)
                 for values in maps
                 for least in (False, True)
             ]
             with reporting(ignore):  # a part is a frame, whatever its passes
                 curves = {
-                    name: removal_curves(
+                    name: removal.removal_curves(
                         predict,
                         inputs[index : index + 1],
                         np.stack(orders)[:, None],
@@ -339,8 +312,10 @@ class JudgingByTruth(Stage[Truth]):
                     )
                     for name in fills
                 }
-                by_marker = np.concatenate([influence_orders(values[None]) for values in maps])
-                curves[TRUE_FILL] = marker_curves(predict, lambda _, back: put_to_baseline(index, back), by_marker)
+                by_marker = np.concatenate([removal.influence_orders(values[None]) for values in maps])
+                curves[TRUE_FILL] = removal.marker_curves(
+                    predict, lambda _, back: put_to_baseline(index, back), by_marker
+                )
             lost = {
                 name: np.trapezoid(curve.lost(np.array([towards]))[:, 0], curve.areas, axis=-1)
                 for name, curve in curves.items()
@@ -348,8 +323,6 @@ class JudgingByTruth(Stage[Truth]):
             return FrameEffects(
                 shapley=estimate.values,
                 shapley_error=estimate.standard_errors,
-                network=answers[0] - answers[1:],
-                margin=marker_readings(frame.scene, frame.number)[1],
                 stick=stick,
                 groups=groups,
                 moved=moved[0] - moved[1:],
@@ -369,11 +342,9 @@ class JudgingByTruth(Stage[Truth]):
             {name: sign * getattr(effect, name) for name in (*_EFFECTS, "moved", "oracle", "shuffled")}
             for sign, effect in zip(explained.towards, effects, strict=True)
         ]
-        judged = dict(self.maps) | {
-            CHANCE: np.random.default_rng(seed).random((len(frames), size, size)),
-            ORACLE: _paint(frames, [rows["oracle"] for rows in along]),
-            DEGRADED: _paint(frames, [rows["shuffled"] for rows in along]),
-        }
+        exact = {ORACLE: [rows["oracle"] for rows in along], DEGRADED: [rows["shuffled"] for rows in along]}
+        judged = dict(self.maps) | {CHANCE: np.random.default_rng(seed).random((len(frames), size, size))}
+        judged |= {name: _paint(frames, values) for name, values in exact.items()}
         values = {
             name: [
                 marker_sums(rows, frame.regions, markers=len(frame.markers))
@@ -381,14 +352,14 @@ class JudgingByTruth(Stage[Truth]):
             ]
             for name, rows_of_map in judged.items()
         }
-        # by the values themselves: the area on which they are painted is no part of them
-        values |= {ORACLE: [rows["oracle"] for rows in along], DEGRADED: [rows["shuffled"] for rows in along]}
+        values |= exact  # by the values themselves: the area on which they are painted is no part of them
         groups, moved = [effect.groups for effect in effects], [rows["moved"] for rows in along]
         neutral = {
             name: np.array([correlate_groups(*of_frame) for of_frame in zip(rows, groups, moved, strict=True)])
             for name, rows in values.items()
         }
         interval = partial(mean_of_defined, clusters=explained.clusters, seed=seed)
+        rows, methods = explained.frames, len(neutral)
         return Truth(
             input=explained.input,
             source=explained.source,
@@ -396,22 +367,14 @@ class JudgingByTruth(Stage[Truth]):
             methods=_judge(judged, frames, along, neutral, explained.clusters, seed=seed),
             neutral_reliability=split_half_reliability(values, groups, moved),
             pairs=pairs,
-            reliability=interval(
-                (reliability_of(effect.shapley, effect.shapley_error) for effect in effects), limits=(0.0, 1.0)
-            ),
             meta=meta_test(effects, interval),
-            effects=_table(frames, effects),
-            neutral=NeutralScores.joined(
-                [
-                    NeutralScores(
-                        frame_id=np.array([frame.id for frame in explained.frames]),
-                        day=np.array([frame.day for frame in explained.frames]),
-                        trial=np.array([frame.trial for frame in explained.frames]),
-                        method=np.repeat(name, len(frames)),
-                        correlation=correlations,
-                    )
-                    for name, correlations in neutral.items()
-                ]
+            effects=MarkerEffects.joined([_tabulate(*pair) for pair in zip(frames, effects, strict=True)]),
+            neutral=NeutralScores(
+                frame_id=np.tile([frame.id for frame in rows], methods),
+                day=np.tile([frame.day for frame in rows], methods),
+                trial=np.tile([frame.trial for frame in rows], methods),
+                method=np.repeat(list(neutral), len(frames)),
+                correlation=np.concatenate(list(neutral.values())),
             ),
         )
 
@@ -425,16 +388,6 @@ def _judge(
     *,
     seed: int,
 ) -> dict[str, Localisation]:
-    means = {name: marker_means(values, frames) for name, values in maps.items()}
-    alike = {
-        name: {
-            truth: np.array(
-                [rank_correlation(values, effect[truth]) for values, effect in zip(of_map, effects, strict=True)]
-            )
-            for truth in _EFFECTS
-        }
-        for name, of_map in means.items()
-    }
     # frames in which nothing changes judge nobody; the others judge all maps
     valid = np.isfinite(neutral[CHANCE])
     ranks, of_valid = {name: rows[valid] for name, rows in neutral.items()}, clusters[:, valid]
@@ -446,48 +399,48 @@ def _judge(
     }
     rng, records = np.random.default_rng(seed), {}
     interval = partial(mean_of_defined, clusters=clusters, seed=seed, limits=(-1.0, 1.0))
-    methods = [name for name in maps if not is_control(name) and name not in (ORACLE, DEGRADED)]
+    methods = [name for name in maps if not is_control(name) and name not in (ORACLE, DEGRADED) and valid.any()]
     for name, values in maps.items():
-        others = [method for method in methods if method != name] if name in methods and valid.any() else []
+        means = marker_means(values, frames)
         positive = np.clip(values.astype(np.float64), 0, None)
-        on_edges = (
-            relevance_mass(rows, frame.edges) - frame.edges.mean() for rows, frame in zip(positive, frames, strict=True)
-        )
+        lead, over = None, {}
+        if name in methods:
+            lead = lead_over_controls(ranks[name], controls, clusters=of_valid, rng=rng)
+            others = [method for method in methods if method != name]
+            over = {key: paired_difference(ranks[name], ranks[key], clusters=of_valid, rng=rng) for key in others}
         records[name] = Localisation(
             neutral=interval(neutral[name]),
-            lead_over_controls=lead_over_controls(ranks[name], controls, clusters=of_valid, rng=rng)
-            if name in methods and valid.any()
-            else None,
-            lead_over_methods={
-                other: paired_difference(ranks[name], ranks[other], clusters=of_valid, rng=rng) for other in others
+            lead_over_controls=lead,
+            lead_over_methods=over,
+            edges=interval(
+                relevance_mass(rows, frame.edges) - frame.edges.mean()
+                for rows, frame in zip(positive, frames, strict=True)
+            ),
+            **{
+                truth: interval(
+                    rank_correlation(row, effect[truth]) for row, effect in zip(means, effects, strict=True)
+                )
+                for truth in _EFFECTS
             },
-            edges=interval(on_edges),
-            **{truth: interval(values) for truth, values in alike[name].items()},
         )
     return records
 
 
-def _table(frames: Sequence[StagedFrame], effects: Sequence[FrameEffects]) -> MarkerEffects:
-    pieces = []
-    for frame, effect in zip(frames, effects, strict=True):
-        count = len(frame.markers)
-        rows = MarkerEffects(
-            frame_id=np.repeat(frame.explained.id, count),
-            day=np.repeat(frame.explained.day, count),
-            trial=np.repeat(frame.explained.trial, count),
-            safety_margin=np.repeat(frame.safety_margin, count),
-            marker=frame.markers.astype(np.int64),
-            x_px=frame.now_px[:, 0],
-            y_px=frame.now_px[:, 1],
-            shapley=effect.shapley,
-            shapley_error=effect.shapley_error,
-            stick=effect.stick,
-            network=effect.network,
-            margin=effect.margin,
-            state=frame.state,
-        )
-        pieces.append(rows)
-    return MarkerEffects.joined(pieces)
+def _tabulate(frame: StagedFrame, effect: FrameEffects) -> MarkerEffects:
+    count = len(frame.markers)
+    return MarkerEffects(
+        frame_id=np.repeat(frame.explained.id, count),
+        day=np.repeat(frame.explained.day, count),
+        trial=np.repeat(frame.explained.trial, count),
+        safety_margin=np.repeat(frame.safety_margin, count),
+        marker=frame.markers.astype(np.int64),
+        x_px=frame.now_px[:, 0],
+        y_px=frame.now_px[:, 1],
+        shapley=effect.shapley,
+        shapley_error=effect.shapley_error,
+        stick=effect.stick,
+        state=frame.state,
+    )
 
 
 def true_curves(
@@ -496,14 +449,14 @@ def true_curves(
     data: Dataset,
     *,
     maps: Mapping[str, Maps],
-    random_orders: int = RANDOM_ORDERS,
+    random_orders: int = removal.RANDOM_ORDERS,
     seed: int = 0,
 ) -> dict[str, RemovalCurve]:
     """Removal curves under the true fill: markers put back, most or least influential first, or in random orders."""
     frames = stage_frames(trained, explained, data)
     inputs = network_inputs(trained, explained)
     passes = len(frames) * (2 * len(maps) + random_orders) * (len(SHARES) - 2)
-    return score_maps_by_marker(
+    return removal.score_maps_by_marker(
         prepare_passes(trained, inputs, passes),
         redrawing(trained, frames, to=[frame.explained.baseline_frame for frame in frames]),
         {name: np.stack(marker_means(values, frames)) for name, values in maps.items()},
