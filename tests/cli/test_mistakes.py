@@ -42,8 +42,8 @@ MISTAKES = {
     "simulate OUT --days 1": "days is 1, but at least 2 are needed",
     f"simulate OUT --seed -1 {SMALL}": "seed is -1",
     f"simulate OUT --sensor flat-gel --displacement calibrated {SMALL}": "sensor flat-gel has half-space; choose",
-    f"simulate OUT --device toaster {SMALL}": "device 'toaster' is not known; use cpu, cuda or cuda:1",
-    f"simulate OUT --device cuda:99 {SMALL}": "device cuda:99 is not on this machine; use cpu",
+    "predict VIDEO --device toaster": "device 'toaster' is not known; use cpu, cuda or cuda:1",
+    "predict VIDEO --device cuda:99": "device cuda:99 is not on this machine; use cpu",
     f"simulate --preview OUT.gif {SMALL}": "does not end in .png, .pdf, .svg",
     "import VIDEO -o OUT --sensor mine": "there is no label; give the table of the force sensor",
     "import VIDEO -o OUT --sensor mine --forces NOTHING": "NOTHING does not exist",
@@ -84,7 +84,6 @@ MISTAKES = {
     "grip -o OUT --controller magic": "there is no controller named 'magic'",
     "grip -o OUT --condition oily": "there is no condition named 'oily'",
     "grip -o OUT --set target": "write NAME=NUMBER",
-    "grip -o OUT --script mass_kg=-1": "mass_kg must be above 0",
     "grip -o OUT --network NOTHING": "the run NOTHING does not exist",
 }
 """Message of each mistake."""

@@ -51,7 +51,7 @@ def test_the_lists_of_the_thesis_give_frames_reference_and_margins(data: Path, i
     np.testing.assert_array_equal(there(trial.reference), images[REFERENCE[0]])
     np.testing.assert_array_equal(margins_of(trial), [1, 0.6, 0.2])
     assert (trial.trial, len(trial), trial.frame_size) == ("train_dataset", 3, (16, 16))
-    assert trial.notes[0] == "train_dataset_gamma.csv: safety margins were read as fractions (by their size)."
+    assert trial.notes[0] == "train_dataset_gamma.csv: safety margins were read as fractions, by their size."
 
 
 @pytest.mark.parametrize("prefix", [HOME, "C:\\Users\\max\\Data\\november\\", "D:/november/", "./", "november/"])
