@@ -233,6 +233,7 @@ def figure_uri(figure: Figure, *, pixels: bool = False) -> str:
     _escape_texts(figure)
     with drawing_style():
         if pixels:
+            figure.draw_without_rendering()  # a first layout does not know the ticks of colour bars yet
             figure.savefig(buffer, format="png", dpi=_DOTS_PER_INCH)
             image = Image.open(buffer).convert("RGB")
             # 256 colours are a fourth of the size; by octree they are spread evenly, not given to the noise of a map
