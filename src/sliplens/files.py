@@ -304,15 +304,14 @@ def is_locked(target: Path) -> bool:
 
 @contextmanager
 def output_folder(
-    target: Path, *, stage: str, config: Any, overwrite: bool = False, run_file: str = RUN_FILE, resumable: bool = True
+    target: Path, *, stage: str, config: Any, overwrite: bool = False, resumable: bool = True
 ) -> Iterator[Output]:
     """Write a folder that is complete or absent.
 
     The caller writes into a hidden folder beside the target (`.NAME.partial`). On success it gets `run.json` (stage,
     configuration and its hash, versions, machine, time) and takes the target's name. After an interruption the partial
     folder remains, and the next call with the same configuration continues in it; a partial folder of another
-    configuration is emptied. If not `resumable`, it is always emptied. `run_file` is the name of the provenance, for
-    formats whose readers must not see `run.json`.
+    configuration is emptied. If not `resumable`, it is always emptied.
 
     Raises
     ------
@@ -323,15 +322,13 @@ def output_folder(
     recipe = to_builtins(config)
     config_hash = hash_json({"stage": stage, "config": recipe, "sliplens": __version__})
     partial, replaced = partial_folder(target), target.with_name(f".{target.name}.replaced")
-    if not (replaced.exists() or lock_file(target).exists()) and _is_complete(
-        target, config_hash, run_file=run_file, overwrite=overwrite
-    ):
+    if not (replaced.exists() or lock_file(target).exists()) and _is_complete(target, config_hash, overwrite=overwrite):
         yield Output(folder=target, complete=True)
         return
     with locked(target):
         if replaced.exists():  # the process that replaced it was killed, before or after the new one took its place
             remove(replaced) if target.exists() else replaced.rename(target)
-        if _is_complete(target, config_hash, run_file=run_file, overwrite=overwrite):
+        if _is_complete(target, config_hash, overwrite=overwrite):
             shutil.rmtree(partial, ignore_errors=True)
             yield Output(folder=target, complete=True)
             return
@@ -353,7 +350,7 @@ def output_folder(
         provenance = Provenance(
             stage=stage, config=recipe, config_hash=config_hash, finished=now, versions=used, machine=machine()
         )
-        write_json(partial / run_file, provenance)
+        write_json(partial / RUN_FILE, provenance)
         recipe_file.unlink()
         if target.exists():
             target.rename(replaced)
@@ -361,15 +358,15 @@ def output_folder(
         shutil.rmtree(replaced, ignore_errors=True)
 
 
-def _is_complete(target: Path, config_hash: str, *, run_file: str, overwrite: bool) -> bool:
+def _is_complete(target: Path, config_hash: str, *, overwrite: bool) -> bool:
     """Return True if a target of the same recipe exists; raise if one exists that may not be replaced."""
     if not target.exists():
         return False
-    if not (target / run_file).is_file() and not (overwrite and target.is_dir() and not any(target.iterdir())):
+    if not (target / RUN_FILE).is_file() and not (overwrite and target.is_dir() and not any(target.iterdir())):
         raise InputError(f"{target} exists and was not made by sliplens; choose another output folder")
     if overwrite:
         return False
-    provenance = read_json(target / run_file)
+    provenance = read_json(target / RUN_FILE)
     if not (isinstance(provenance, dict) and provenance.get("config_hash") == config_hash):
         raise InputError(f"{target} holds a result of other settings; choose another folder or pass --overwrite")
     return True
