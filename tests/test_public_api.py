@@ -131,6 +131,15 @@ def test_a_number_has_a_unit_and_an_array_a_shape(module, name, thing):
     assert not lacking
 
 
+@pytest.mark.parametrize("name", [name for name in sliplens.__all__ if inspect.isfunction(getattr(sliplens, name))])
+def test_a_call_has_an_example_and_names_its_neighbours(name):
+    doc = inspect.getdoc(getattr(sliplens, name)) or ""
+    neighbours = re.findall(r"^(\w+) : ", doc.partition("See Also\n--------\n")[2].partition("\n\n")[0], re.MULTILINE)
+    assert neighbours
+    assert set(neighbours) <= set(sliplens.__all__) - {name}
+    assert ">>> " in doc
+
+
 def test_the_rule_of_units_and_shapes_can_fail():
     def press(force: float, frames: np.ndarray, depth_m: float) -> None:
         """Press."""
