@@ -252,7 +252,6 @@ def test_image_equal_to_its_reference_has_nothing_to_explain(name, network, imag
 
 def explanation_of(relevance, *, prediction: float, reference: float) -> Attribution:
     return Attribution(
-        images=torch.zeros(1, 3, len(relevance), len(relevance[0])),
         relevance=torch.tensor([relevance]),
         method="by hand",
         target="f(x) - f(reference)",

@@ -185,8 +185,6 @@ class Approximation:
 class Attribution:
     """Maps of a batch of images by one method: why a network predicts f(x) rather than f(reference)."""
 
-    images: Float[Tensor, "batch colours height width"]
-    """Images x, in [0, 1]."""
     relevance: Float[Tensor, "batch height width"]
     """Signed contribution of each pixel in margin units (float32): above zero where it raises the prediction."""
     target: str

@@ -141,7 +141,6 @@ class Comparison:
             _require_finite(predictions, name)
         gap = (relevance.sum(dim=(1, 2)) - self.change).abs().float() if complete else None
         return Attribution(
-            images=self.images.float(),
             relevance=relevance.float(),
             target=target,
             prediction=self.prediction.float(),

@@ -74,8 +74,6 @@ class TrainingConfig:
         wrong = self.head != "margin-and-ratio" or self.optimizer != "adamw" or self.augmentation != "none"
         if self.learns == "ratio" and (wrong or self.weight_decay):
             raise InputError("to learn F_t / F_n alone, leave out --head, --optimizer, --augmentation and weight_decay")
-        if self.learns == "sequence" and (self.max_minutes is not None or self.optimizer != "adamw"):
-            raise InputError("a head of several frames is trained by AdamW; leave out --max-minutes and --optimizer")
         pick(HEADS, self.head, noun="head")
         get_augmentation(self.augmentation)
 

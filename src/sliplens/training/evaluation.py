@@ -138,8 +138,6 @@ def evaluate_frames(
 
     `friction` (a coefficient) and `sequence` as `evaluate` takes them.
     """
-    if not len(frames):
-        raise RecordingError("there is no labelled frame to evaluate; check the split and the condition")
     names = np.array(frames.trial)
     for name in np.unique(names) if sequence else ():
         require_frequent(np.sort(frames.time_s[names == name]), what=f"the trial {name}")
@@ -208,18 +206,14 @@ def _follow_trials(
     network: Network, estimate: Estimate, trial: Sequence[str], time_s: Float[np.ndarray, " frames"]
 ) -> Estimate:
     """Correct the frames of each trial in the order of their times (`Follower`); all of them touch."""
-    assert estimate.probabilities is not None
-    margin, probabilities = np.empty_like(estimate.margin), np.empty_like(estimate.probabilities)
-    names, calibration, alone = np.array(trial), None, np.zeros(len(estimate.margin), dtype=bool)
-    for name in dict.fromkeys(trial):
-        rows = np.flatnonzero(names == name)
-        rows = rows[np.argsort(time_s[rows], kind="stable")]
-        part = network.follow().update(estimate.at(rows), time_s[rows], np.ones(len(rows), dtype=bool))
-        assert part.probabilities is not None
-        margin[rows], probabilities[rows], calibration = part.margin, part.probabilities, part.calibration
-        alone[rows] = False if part.alone is None else part.alone[0]
-    single = (alone, estimate.calibration) if alone.any() else None
-    return replace(estimate, margin=margin, probabilities=probabilities, calibration=calibration, alone=single)
+    _, number = np.unique(np.array(trial), return_inverse=True)
+    start_s = np.full(number.max() + 1, np.inf)
+    np.minimum.at(start_s, number, time_s)
+    passed_s = time_s - start_s[number]
+    order = np.lexsort((passed_s, number))
+    clock_s = passed_s - number * (passed_s.max() + 1)  # runs back from trial to trial, which clears the memory
+    followed = network.follow().update(estimate.at(order), clock_s[order], np.ones(len(order), dtype=bool))
+    return followed.at(np.argsort(order))
 
 
 def _r2(truth: Float[np.ndarray, " _"], predicted: Float[np.ndarray, " _"]) -> float | None:
