@@ -91,14 +91,6 @@ def test_equals_the_derivation_one_mask_at_a_time(name, count, network, images, 
     np.testing.assert_allclose(explanation.relevance[0], expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
 
 
-def test_the_map_changes_with_the_head(network, images):
-    model = network("small shufflenet")
-    before = PolyCam()(model, images[:1]).saliency
-    with torch.no_grad():
-        model.fc.weight.copy_(model.fc.weight.flip(1))
-    assert not torch.allclose(before, PolyCam()(model, images[:1]).saliency, atol=0.1)
-
-
 def test_sums_to_the_change_with_its_sign(network, images, reference):
     # no channel supports the change of the second image, which leaves its map zero
     explanation = PolyCam()(network("small shufflenet"), images[[0, 2]], reference=reference)

@@ -71,11 +71,6 @@ def test_blurring_keeps_a_constant_image_and_wipes_out_a_dot():
     assert filled("blur", dot, ALL[0]).max() < 1.1 / (2 * np.pi * 4)
 
 
-def test_an_unknown_fill_lists_those_there_are():
-    with pytest.raises(InputError, match="no fill named 'pink'; choose one of grey, black, white, background, blur"):
-        get_fill("pink")
-
-
 def slow_noisy_linear(image: np.ndarray, gone: np.ndarray) -> np.ndarray:
     """One equation for each removed pixel, solved as a dense system."""
     height, width = gone.shape
