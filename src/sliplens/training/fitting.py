@@ -96,7 +96,8 @@ def train(
 ) -> Network:
     """Train a network on a data set, and keep the weights that are best on its validation trials.
 
-    Interrupted, it continues after the last whole epoch when it is called again with the same `out`.
+    Interrupted, it continues after the last whole epoch when it is called again with the same `out`; the recipe
+    `sequence`, of minutes, begins anew.
 
     Parameters
     ----------
