@@ -37,9 +37,9 @@ SCORED = (0.4, 0.2, 0.0)
 GAINS = {"grad-cam": -0.05, "integrated-gradients": 0.06, "poly-cam": 0.16, "edges": 0.02, "centre": 0.01}
 SPEARMAN = {"grad-cam": 0.3, "integrated-gradients": 0.4, "poly-cam": 0.7, "poly-cam-thesis": 0.2}
 MAP_MEASURES = {
-    "grad-cam": {"resolution": 0.05, "total_variation": 0.01},
-    "integrated-gradients": {"resolution": 0.7, "total_variation": 0.2},
-    "poly-cam": {"resolution": 0.6, "total_variation": 0.05},
+    "grad-cam": {"resolution": 0.05, "total_variation": 0.01, "infidelity": 0.2, "max_sensitivity": 0.1},
+    "integrated-gradients": {"resolution": 0.7, "total_variation": 0.2, "infidelity": 0.1, "max_sensitivity": 0.4},
+    "poly-cam": {"resolution": 0.6, "total_variation": 0.05, "infidelity": 0.15, "max_sensitivity": 0.2},
 }
 
 
