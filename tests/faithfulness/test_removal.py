@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from sliplens.errors import InputError
 from sliplens.explainers.occlusion import tile_regions
 from sliplens.faithfulness.fills import get_fill
 from sliplens.faithfulness.removal import (
@@ -119,10 +118,3 @@ def test_a_network_that_answers_always_alike_moves_by_nothing(images: torch.Tens
     orders = np.stack([[random_unit_order(PIXELS, rng=rng)] * IMAGES])
     curves = removal_curves(lambda batch: torch.full((len(batch),), 0.3), images, orders, fill=get_fill("grey"))
     assert np.all(curves.lost(UP) == 0)
-
-
-@pytest.mark.parametrize("areas", [(0.1, 1.0), (0.0, 0.5), (0.0, 0.5, 0.5, 1.0)])
-def test_areas_rise_from_nothing_to_all(areas: tuple[float, ...], images: torch.Tensor):
-    orders = np.zeros((1, IMAGES, SIZE * SIZE), dtype=np.int64)
-    with pytest.raises(InputError, match="areas must rise from 0 to 1"):
-        removal_curves(lambda batch: batch.mean(dim=(1, 2, 3)), images, orders, fill=get_fill("grey"), areas=areas)

@@ -1,6 +1,5 @@
 """Training and evaluation as calls of the library, from a data set to a record."""
 
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -10,26 +9,7 @@ from there import there
 
 import sliplens as sl
 from sliplens.errors import InputError
-from sliplens.progress import OnProgress
 from sliplens.recordings import Dataset
-
-
-class Notes:
-    """Keeps the sentences that a command would show."""
-
-    def __init__(self) -> None:
-        self.sentences: list[str] = []
-
-    def __call__(self, done: int, total: int, /) -> None: ...
-
-    def wrote(self, path: Path, what: str, /, *, kept: bool = False) -> None: ...
-
-    def stage(self, _title: str, /) -> AbstractContextManager[OnProgress]:
-        return nullcontext(self)
-
-    def note(self, message: str, /) -> None:
-        self.sentences.append(message)
-
 
 SMALL: dict[str, Any] = {"image_size": 32, "epochs": 2, "batch_size": 11, "head": "point", "untouched_share": 0.0}
 
@@ -70,11 +50,9 @@ def test_what_was_written_comes_back_as_it_was_returned(small_dataset: Dataset, 
 def test_a_network_that_is_adapted_stays_of_its_kind(small_dataset: Dataset):
     once: dict[str, Any] = SMALL | {"epochs": 1}
     start = sl.train(small_dataset, **once, input="raw")
-    notes = Notes()
     short: dict[str, Any] = {"epochs": 1, "epoch_frames": 32, "learning_rate": 1e-12}
-    run = sl.train(small_dataset, recipe="adapt", start_from=start, **short, on_progress=notes)
+    run = sl.train(small_dataset, recipe="adapt", start_from=start, **short)
     for name in ("input", "backbone", "head", "image_size"):
         assert getattr(run.manifest, name) == getattr(start.manifest, name)
-    assert any("6 labelled trials" in sentence for sentence in notes.sentences)
     with pytest.raises(InputError, match="teaches an existing network; name it with --start-from"):
         sl.train(small_dataset, recipe="adapt")

@@ -97,12 +97,8 @@ class Comparison:
     @property
     def close(self) -> float:
         """Change of the prediction below which there is next to nothing to explain."""
-        return CLOSE if self.of_margin else CLOSE * float(self.change.abs().max())
-
-    @property
-    def of_margin(self) -> bool:
-        """True if the network predicts safety margins, False for a wrapped module of another output."""
-        return not isinstance(self.model, OneOutput)
+        # of a wrapped module the output has another unit
+        return CLOSE * float(self.change.abs().max()) if isinstance(self.model, OneOutput) else CLOSE
 
     @property
     def reference(self) -> Float[Tensor, "batch colours height width"]:
@@ -162,7 +158,7 @@ class Comparison:
                 f"f(x) = {high:.3g} is within {close:.2g} of f(reference) = {low:.3g}, so there is next to nothing to "
                 "explain": abs(change) < close,
                 f"f(reference) = {low:.3g} is no safety margin, so the reference lies far from the data and the map "
-                "shows the way from there": self.of_margin and not _LOWEST <= low <= _HIGHEST,
+                "shows the way from there": not isinstance(self.model, OneOutput) and not _LOWEST <= low <= _HIGHEST,
                 "the map holds NaN or infinity and must not be shown or scored": not finite,
                 "the map is zero everywhere and says nothing about the image": finite and not image_map.any(),
                 f"the map leaves {missing:.2g} of f(x) - f(reference) = {change:.2g} unexplained, more than "

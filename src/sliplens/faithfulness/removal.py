@@ -141,15 +141,8 @@ def removal_curves(
 
     Inputs are in [0, 1], as the references, those of the baseline, where the fill needs them. Orders are flat
     pixel indices, first to be removed first (`unit_order`); areas are shares of the image, rising from 0 to 1.
-
-    Raises
-    ------
-    InputError
-        If the areas do not rise from 0 to 1.
     """
     shares = np.asarray(areas, dtype=np.float64)
-    if shares[0] != 0 or shares[-1] != 1 or np.any(np.diff(shares) <= 0):
-        raise InputError(f"areas must rise from 0 to 1, got {list(areas)}")
     removed = np.round(shares * images.shape[-2] * images.shape[-1]).astype(np.int64).tolist()
     last, jobs, engine, done = len(shares) - 1, [], _as_engine(predict), 0
     for image in range(len(images)):

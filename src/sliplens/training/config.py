@@ -1,14 +1,10 @@
 """Settings of a training, recipes, and loggers."""
 
-import logging
-import os
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypedDict
 
-from lightning.pytorch.loggers import Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
+from lightning.pytorch.loggers import Logger, TensorBoardLogger
 
 from sliplens.errors import InputError
 from sliplens.extras import missing_packages, pick
@@ -140,67 +136,14 @@ an existing network its second output, F_t / F_n, `sequence` a head for several 
 few trials, all in minutes."""
 
 
-PROJECT = "sliplens"
-"""Project in Weights & Biases, and experiment in MLflow."""
-
-
-def _make_wandb(folder: Path, run_name: str) -> Logger:
-    # whoever is logged in for something else has not asked to send this
-    offline = "WANDB_MODE" not in os.environ
-    os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
-    os.environ.setdefault("WANDB_SILENT", "true")
-    from wandb import Settings  # noqa: PLC0415 (an extra)  # pyright: ignore[reportMissingImports]
-
-    settings = Settings(console="off", disable_git=True, x_disable_stats=True, x_disable_meta=True)
-    return WandbLogger(name=run_name, save_dir=folder, project=PROJECT, offline=offline, settings=settings)
-
-
-def _make_mlflow(folder: Path, run_name: str) -> Logger:
-    os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-    os.environ.setdefault("MLFLOW_LOGGING_LEVEL", "WARNING")
-    logging.getLogger("lightning.pytorch.loggers.mlflow").setLevel(logging.ERROR)  # "Experiment not found. Creating it"
-    address = os.environ.get("MLFLOW_TRACKING_URI")
-    if not address:
-        (folder / "mlflow").mkdir(exist_ok=True)
-        address = f"sqlite:///{folder.resolve() / 'mlflow' / 'mlflow.db'}"
-    return MLFlowLogger(experiment_name=PROJECT, run_name=run_name, tracking_uri=address)
-
-
-LOGGERS: dict[str, tuple[tuple[str, ...], Callable[[Path, str], Logger]]] = {
-    "tensorboard": (
-        ("tensorboard",),
-        lambda folder, _: TensorBoardLogger(folder, name="tensorboard", version="", default_hp_metric=False),
-    ),
-    "wandb": (("wandb",), _make_wandb),
-    # mlflow-skinny, which lacks the latter, keeps no runs on this machine
-    "mlflow": (("mlflow", "sqlalchemy"), _make_mlflow),
-}
-"""Packages that each logger needs, and the function that makes it."""
-
-
-@contextmanager
-def open_logger(
-    name: str, folder: Path, *, run_name: str, recipe: Mapping[str, str | float | None]
-) -> Iterator[Logger | None]:
-    """Open a logger that keeps its files in the run's folder, and close it so that the folder can be renamed.
-
-    Nothing leaves the machine unless `WANDB_MODE` is `online` or `MLFLOW_TRACKING_URI` is set. `csv` opens none, for
-    `metrics.csv` is always written.
-    """
-    if name == "csv":
-        yield None
-        return
-    packages, make = pick(LOGGERS, name, noun="logger")
-    if missing := missing_packages(*packages, extra="tracking"):
-        raise InputError(f"--logger {name} needs {missing}, or leave --logger away, for metrics.csv is always written")
-    try:
-        logger = make(folder, run_name)
-        logger.log_hyperparams(dict(recipe))
-    except Exception as error:  # these libraries have trees of errors of their own
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise InputError(f"--logger {name} does not start ({reason}); mend that, or leave --logger away") from None
-    try:
-        yield logger
-    finally:
-        if name == "wandb":
-            logger.experiment.finish()  # pyright: ignore[reportAttributeAccessIssue]
+def make_logger(logger: Logger | str, folder: Path) -> Logger | None:
+    """Return a logger by name, or that of Lightning: `tensorboard` keeps its files in the folder, `csv` is none."""
+    if not isinstance(logger, str) or logger == "csv":
+        return None if isinstance(logger, str) else logger
+    if logger != "tensorboard":
+        raise InputError(
+            f"there is no logger named {logger!r}; choose csv or tensorboard, or in Python one of Lightning"
+        )
+    if missing := missing_packages("tensorboard", extra="tracking"):
+        raise InputError(f"--logger tensorboard needs {missing}, or leave it away: metrics.csv is always written")
+    return TensorBoardLogger(folder, name="tensorboard", version="", default_hp_metric=False)

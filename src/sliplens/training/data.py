@@ -1,14 +1,10 @@
 """Frames of a training, their augmentation and their order."""
 
 import math
-import os
-import tempfile
 from collections import deque
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -191,11 +187,9 @@ def load_frames(
     encoding: Encoding,
     image_size: int,
     untouched_share: float = 0.0,
-    scratch: Path | None = None,
 ) -> FrameSet:
     """Load trials, encode them, and keep the frames that have a label; frames without contact have none.
 
-    Frames that would take more than half of the free memory go into a file in the folder `scratch`, deleted with them.
     `untouched_share` adds the untouched sensor, with the label 1 (the limit of light touches), this often for each
     labelled frame and at least once a trial: a network trained on it gives explanations a meaningful reference.
     """
@@ -207,7 +201,7 @@ def load_frames(
     if not sum(counts):
         raise RecordingError(f"{data.folder}: no frame of the {len(trials)} trials has a label; label them first")
     total = sum(count + copies_of(count) for count in counts)
-    images = _allocate((total, encoding.colours, image_size, image_size), scratch)
+    images = torch.empty((total, encoding.colours, image_size, image_size), dtype=torch.uint8)
     labels, ratios, frictions, times, rows = [], [], [], [], []
     for info in report_each(trials):
         recording = data.load(info, truth=False)
@@ -236,18 +230,6 @@ def load_frames(
         day=day,
         time_s=np.concatenate(times),
     )
-
-
-def _allocate(shape: tuple[int, int, int, int], scratch: Path | None) -> UInt8[Tensor, "frames colours size size"]:
-    """Allocate images in memory, or in an unnamed file that is deleted with the last reference."""
-    size, free = int(np.prod(shape)), float("inf")
-    with suppress(AttributeError, OSError, ValueError):  # not every system says
-        free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    if scratch is None or size <= free / 2:
-        return torch.empty(shape, dtype=torch.uint8)
-    with tempfile.TemporaryFile(dir=scratch) as file:
-        file.truncate(size)
-        return torch.from_numpy(np.memmap(file, dtype=np.uint8, mode="r+", shape=shape))
 
 
 class EpochShuffle(Sampler[int]):

@@ -40,7 +40,7 @@ from sliplens.recordings.dataset import load_dataset
 from sliplens.recordings.trial import Recording
 from sliplens.results.evaluation import Training
 from sliplens.shear import FULL_CIRCLE, Shear, ShearEstimator, enclosing_range
-from sliplens.training.config import RECIPES, TrainingChanges, TrainingConfig, open_logger
+from sliplens.training.config import RECIPES, TrainingChanges, TrainingConfig, make_logger
 from sliplens.training.data import (
     EpochShuffle,
     FrameSet,
@@ -59,8 +59,6 @@ from sliplens.training.module import (
 )
 from sliplens.training.sequence import fit_sequence
 
-_ENOUGH_TRIALS, _FEW_TRIALS = 10, 30
-"""Labelled trials that adapting needs, and that random weights need, as measured by `benchmarks/adapt.py`."""
 _KIND = {
     "all": ("backbone", "head"),
     "weights": ("backbone", "head", "image_size"),
@@ -89,7 +87,7 @@ def train(
     recipe: str = "default",
     start_from: Network | Path | str | None = None,
     condition: str | None = None,
-    logger: str = "csv",
+    logger: Logger | str = "csv",
     overwrite: bool = False,
     on_progress: OnProgress | None = None,
     **options: Unpack[TrainingChanges],
@@ -115,7 +113,7 @@ def train(
     condition
         Train and validate on the trials of one condition alone, such as dry.
     logger
-        Logger besides `metrics.csv`: `csv` for none, or a row of `LOGGERS`.
+        Logger besides `metrics.csv`: `csv` for none, `tensorboard`, or a logger of Lightning, such as `WandbLogger()`.
     overwrite
         If True, replace a folder `out` of other settings.
     on_progress
@@ -170,7 +168,7 @@ def train(
     def run(folder: Path, opened: Logger | None = None) -> Training:
         if start is not None and config.learns == "sequence":
             return replace(fit_sequence(config, start, data, trials, folder), condition=condition)
-        load_some = partial(load_frames, data, encoding=encoding, image_size=config.image_size, scratch=folder)
+        load_some = partial(load_frames, data, encoding=encoding, image_size=config.image_size)
         with open_stage(f"Reading training trials ({encoding.name})"):
             train_frames = load_some(trials[0], untouched_share=config.untouched_share)
         with open_stage(f"Reading validation trials ({encoding.name})"):
@@ -193,7 +191,7 @@ def train(
         return replace(training, condition=condition)
 
     with reporting(on_progress):
-        for sentence in _advise(config, *trials, start=start):
+        for sentence in _advise(config, start):
             add_note(sentence)
         if out is None:
             with scratch_folder() as folder:
@@ -202,9 +200,10 @@ def train(
         out = Path(out)
         with output_folder(out, stage="train", config={**origin, "training": config}, overwrite=overwrite) as output:
             if not output.complete:
-                recipe_values = {**asdict(config), **origin}
-                with open_logger(logger, output.folder, run_name=out.name, recipe=recipe_values) as opened:
-                    save_result(run(output.folder, opened), output.folder)
+                opened = make_logger(logger, output.folder)
+                if opened is not None:
+                    opened.log_hyperparams({**asdict(config), **origin})
+                save_result(run(output.folder, opened), output.folder)
         network = load(out)
         training = network.training
         assert training is not None
@@ -280,18 +279,8 @@ def pull_direction(trial: Recording) -> float | None:
     return mean.direction_deg if np.hypot(mean.x_px, mean.y_px) > _SURE * mean.sigma_px else None
 
 
-def _advise(
-    config: TrainingConfig, train: Sequence[TrialInfo], validation: Sequence[TrialInfo], *, start: Network | None
-) -> Iterator[str]:
-    """Advise on the number of trials, and on abilities of the network to start from that will be lost."""
-    count = len(train) + len(validation)
-    if config.learns == "weights":
-        yield (
-            f"{count} labelled trials, {len(validation)} of them held out; on simulated sensors {_ENOUGH_TRIALS} had "
-            "about nine tenths of the R2 of 100: record as many, on several days, to the slip"
-        )
-    elif start is None and count < _FEW_TRIALS:
-        yield (f"{count} labelled trials are few for random weights; use --recipe adapt --start-from chromatouch-pair")
+def _advise(config: TrainingConfig, start: Network | None) -> Iterator[str]:
+    """Name abilities of the network to start from that will be lost."""
     if start is not None and start.manifest.head == "margin-and-ratio" and config.head == "histogram":
         yield "the labels have no forces and friction, so the network learns the margin alone: it takes no --friction"
     elif start is not None and start.sequence is not None and config.learns != "sequence":
