@@ -4,7 +4,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Event, Lock
+from threading import Lock
 
 import numpy as np
 
@@ -81,7 +81,7 @@ class GripSource(LiveSource):
         self._object, self._friction, self._tip = pick(OBJECTS, object, noun="object"), friction, Fingertip(seed=seed)
         self.name, self.rate_hz, self.reference = f"a simulated gripper ({object})", rate_hz, self._tip.reference
         self.size = self.reference.shape[0], self.reference.shape[1]
-        self._lock, self._closed = Lock(), Event()
+        self._lock = Lock()
         self.water_kg, self.pull_n, self.wet = 0.0, 0.0, False
         self.controller = controller
         """Row of `CONTROLLERS` in use."""
@@ -145,7 +145,7 @@ class GripSource(LiveSource):
 
     def frames(self) -> Iterator[LiveFrame]:
         """Draw frames of the fingertip while the gripper goes on."""
-        pace, number, rate_hz = Pace(self._closed), 0, self.rate_hz or 30.0
+        pace, number, rate_hz = Pace(self.closed), 0, self.rate_hz or 30.0
         while pace.wait(number / rate_hz):
             captured_s, time_s = time.monotonic(), number / rate_hz
             with self._lock:
@@ -168,10 +168,6 @@ class GripSource(LiveSource):
                 safety_margin=margin if force_n > _FAINTEST_N and np.isfinite(margin) else None,
             )
             number += 1
-
-    def close(self) -> None:
-        """Stop at the next frame."""
-        self._closed.set()
 
     def _advance(self, time_s: float) -> None:
         """Step until a time; begin again some time after a drop."""

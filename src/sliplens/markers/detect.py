@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-from sliplens.errors import ImageError, InputError
+from sliplens.errors import ImageError
 from sliplens.extras import import_cv2, pick
 from sliplens.images import require_rgb
 
@@ -25,15 +25,6 @@ class MarkerKind:
     """Smallest and largest radius, in pixels."""
     channels: tuple[float, float, float] | None = None
     """Weights of red, green and blue for measuring centres; estimated from the markers if None."""
-
-    def __post_init__(self) -> None:
-        low, high = self.radius_px
-        if not 0 < low < high:
-            raise InputError(f"markers of {self.name} have radii from {low:g} to {high:g} px; give a low and a high")
-        if self.channels is not None and (min(self.channels) < 0 or sum(self.channels) <= 0):
-            raise InputError(
-                f"the channels of {self.name} weigh {self.channels}; give weights of 0 or more, one of them positive"
-            )
 
 
 @dataclass(frozen=True, kw_only=True)
