@@ -42,7 +42,7 @@ from sliplens.recordings.formats.tables import open_text_table
 from sliplens.recordings.options import LabelSettings
 from sliplens.simulation.geometry import Dome
 from sliplens.simulation.loading import load_at_states, move_markers
-from sliplens.simulation.nuisances import Grasp, Touch
+from sliplens.simulation.nuisances import Grasp
 from sliplens.simulation.sensor import CHROMATOUCH
 from sliplens.training import evaluate, train
 
@@ -233,7 +233,7 @@ def simulate(dome: SeenDome, stiffness: float, model: str, force_n: np.ndarray) 
         margin, one = np.array([1 - np.hypot(x_n, z_n) / normal_n]), np.ones(1)
         grasp = Grasp(friction=1.0, contact_offset=(0.0, 0.0), shear_direction_rad=float(np.arctan2(z_n, x_n)))
         loading = load_at_states(normal_n * one, friction=one, margins=margin)
-        motion = move_markers(sensor, Touch(grasp=grasp), loading=loading, displacement=model)
+        motion = move_markers(sensor, grasp, loading=loading, displacement=model)
         fields.append(motion.centres_px[0] - motion.rest_px)
     return np.array(fields)
 

@@ -11,7 +11,7 @@ from sliplens.mechanics import contact_radius, reduced_modulus, stick_ratio
 from sliplens.simulation import CHROMATOUCH, FLAT_GEL
 from sliplens.simulation.geometry import FlatPad
 from sliplens.simulation.loading import load_at_margins, move_markers
-from sliplens.simulation.nuisances import Grasp, Touch
+from sliplens.simulation.nuisances import Grasp
 
 WAYS = [(CHROMATOUCH, "calibrated"), (CHROMATOUCH, "half-space"), (FLAT_GEL, "half-space")]
 CENTRED = Grasp(contact_offset=(0.0, 0.0), shear_direction_rad=0.0)
@@ -21,7 +21,7 @@ PAD = cast("FlatPad", FLAT_GEL.geometry)
 
 def moved(sensor, displacement, margins=(1.0, 0.8, 0.6, 0.4, 0.2, 0.0), grasp=CENTRED, **more):
     loading = load_at_margins(np.array(margins), grasp=grasp)
-    touch = Touch(grasp=grasp, **{"marker_depth": 0.0, **more})
+    touch = replace(grasp, **{"marker_depth": 0.0, **more})
     return move_markers(sensor, touch, loading=loading, displacement=displacement)
 
 
@@ -102,7 +102,7 @@ def shifted(margin: float, *, let_back: float = 0.0, retaken: float = 0.0) -> np
     pressed, pulled = (load_at_margins(np.array([value]), grasp=CENTRED) for value in (1.0, margin))
     pulled = replace(pulled, let_back=np.array([let_back]), retaken=np.array([retaken]))
     first, second = (
-        move_markers(FLAT_GEL, Touch(grasp=CENTRED, marker_depth=0.0), loading=one) for one in (pressed, pulled)
+        move_markers(FLAT_GEL, replace(CENTRED, marker_depth=0.0), loading=one) for one in (pressed, pulled)
     )
     return second.centres_px[0] - first.centres_px[0]
 

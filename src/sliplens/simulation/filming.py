@@ -12,7 +12,7 @@ from torch import Tensor
 from sliplens.mechanics import normal_slope
 from sliplens.simulation.geometry import Point, Rays, pixel_grid
 from sliplens.simulation.loading import Loading, Motion, move_markers
-from sliplens.simulation.nuisances import Day, Grasp, Nuisances, Touch, Unit
+from sliplens.simulation.nuisances import Day, Grasp, Nuisances, Unit
 from sliplens.simulation.sensor import Sensor, mix_noise, pick_noise
 
 Planes: TypeAlias = Float32[np.ndarray, "3 height width"]
@@ -249,8 +249,8 @@ def see_markers(
     sensor: Sensor, *, loading: Loading, grasp: Grasp, day: Day, unit: Unit, displacement: str | None = None
 ) -> tuple[Motion, Float[np.ndarray, "markers 2"], Float[np.ndarray, "frames markers 2"]]:
     """Compute the motion, and the markers' places (pixels, x and y) in the image at rest and in each frame."""
-    touch = Touch(grasp=grasp, modulus_factor=day.modulus_factor, marker_depth=unit.marker_depth)
-    motion = move_markers(sensor, touch, loading=loading, displacement=displacement)
+    grasp = replace(grasp, modulus_factor=day.modulus_factor, marker_depth=unit.marker_depth)
+    motion = move_markers(sensor, grasp, loading=loading, displacement=displacement)
     see = partial(_see, centre_px=np.asarray(sensor.geometry.centre_px), day=day)
     return motion, see(motion.rest_px + unit.marker_jitter_px), see(motion.centres_px + unit.marker_jitter_px)
 

@@ -18,7 +18,7 @@ from sliplens.mechanics import (
 )
 from sliplens.recordings.trial import ContactState, contact_states
 from sliplens.simulation.geometry import Frames
-from sliplens.simulation.nuisances import Grasp, Touch
+from sliplens.simulation.nuisances import Grasp
 from sliplens.simulation.sensor import Sensor
 
 _FALL_S = 0.06  # time in which friction falls from static to kinetic once the contact slips (assumed)
@@ -359,8 +359,8 @@ class Motion:
     stick_radius_m: Float[np.ndarray, " frames"]
 
 
-def move_markers(sensor: Sensor, touch: Touch, *, loading: Loading, displacement: str | None = None) -> Motion:
-    """Displace a sensor's markers by a loading, and by the offset, tilt, shear and creep of the touch.
+def move_markers(sensor: Sensor, grasp: Grasp, *, loading: Loading, displacement: str | None = None) -> Motion:
+    """Displace a sensor's markers by a loading, and by the offset, tilt, shear and creep of the grasp.
 
     `displacement`: a row of `DISPLACEMENTS`; the sensor's default if None.
     """
@@ -369,12 +369,12 @@ def move_markers(sensor: Sensor, touch: Touch, *, loading: Loading, displacement
         raise ContactError(
             f"sensor {sensor.name} cannot be moved by {name!r}; choose {' or '.join(sensor.displacements)}"
         )
-    model, grasp = DISPLACEMENTS[name], touch.grasp
+    model = DISPLACEMENTS[name]
     modulus_pa = sensor.youngs_modulus_pa
     if name == "calibrated" and sensor.effective_modulus_pa is not None:
         modulus_pa = sensor.effective_modulus_pa
     geometry = sensor.geometry
-    sphere_m, depth_m = geometry.sphere_radius_m, touch.marker_depth * geometry.sphere_radius_m
+    sphere_m, depth_m = geometry.sphere_radius_m, grasp.marker_depth * geometry.sphere_radius_m
     rest = geometry.marker_positions(depth_m)
     creep = 1 + grasp.creep * (1 - np.exp(-loading.held_s / grasp.creep_time_s))
 
@@ -382,7 +382,7 @@ def move_markers(sensor: Sensor, touch: Touch, *, loading: Loading, displacement
         modulus = reduced_modulus(youngs_modulus_pa=modulus_pa * factor, poisson_ratio=sensor.poisson_ratio)
         return np.asarray(contact_radius(force_n, sphere_radius_m=sphere_m, reduced_modulus_pa=modulus))
 
-    contact_m = radius(loading.normal_force_n * creep, touch.modulus_factor)
+    contact_m = radius(loading.normal_force_n * creep, grasp.modulus_factor)
     nominal_m = radius(np.array([Grasp().normal_force_n]), 1.0)
     sunken = (contact_m / nominal_m) ** 2
     clamp = geometry.slope_cosine(rest) ** model.clamp_exponent

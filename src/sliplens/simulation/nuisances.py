@@ -158,16 +158,10 @@ class Grasp:
     veil: tuple[float, float, float] = (5.3, 4.8, 4.2)
     glow: tuple[float, float, float] = (4.0, 3.8, 2.6)
     skin_grain: float = 1.5
-
-
-@dataclass(frozen=True, kw_only=True)
-class Touch:
-    """Parameters that move the markers of a frame, besides the safety margin."""
-
-    grasp: Grasp
     modulus_factor: float = 1.0
+    """That of the day."""
     marker_depth: float = 0.03
-    """Depth of the markers under the skin, in radii of the contact's sphere."""
+    """Depth of the sensor's markers under the skin, in radii of the contact's sphere."""
 
 
 _BUILT_IN = tuple(
