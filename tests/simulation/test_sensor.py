@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from sliplens.errors import ContactError
 from sliplens.simulation import CHROMATOUCH, FLAT_GEL
 from sliplens.simulation.geometry import Dome, FlatPad
-from sliplens.simulation.sensor import MarkerLook
+from sliplens.simulation.sensor import MarkerLook, mix_noise, pick_noise
 
 DOME, PAD = cast("Dome", CHROMATOUCH.geometry), cast("FlatPad", FLAT_GEL.geometry)
 
@@ -50,6 +50,23 @@ def test_rings_are_where_they_were_measured():
     for ring, radius in ((1, 30.9), (2, 62.1), (3, 93.6)):
         np.testing.assert_allclose(from_apex[rings == ring], radius, atol=0.76)
     assert sum(DOME.ring_counts) == 82
+
+
+@pytest.mark.parametrize("noise", [CHROMATOUCH.noise, FLAT_GEL.noise], ids=["chromatouch", "flat-gel"])
+def test_neighbours_and_colours_share_the_noise_they_should(noise):
+    mixed = mix_noise(pick_noise(400, rng=np.random.default_rng(0)), noise=noise, image_size_px=64).numpy()
+
+    def correlation(one, other):
+        return float(np.mean(one * other))
+
+    weight = noise.smoothness
+    for axis in (2, 3):
+        ahead, behind = (np.take(mixed, range(*ends), axis=axis) for ends in ((1, 64), (0, 63)))
+        # the moving average 1, w has this correlation at lag 1, and none beyond
+        assert correlation(ahead[2], behind[2]) == pytest.approx(weight / (1 + weight**2), abs=0.01)
+    assert correlation(mixed[2, :, 2:], mixed[2, :, :-2]) == pytest.approx(0, abs=0.01)
+    assert correlation(mixed[0], mixed[1]) == pytest.approx(noise.red_in_green, abs=0.01)
+    assert correlation(mixed[0], mixed[2]) == pytest.approx(0, abs=0.01)
 
 
 @pytest.mark.parametrize(
