@@ -11,7 +11,17 @@ from sliplens.recordings import Dataset
 
 
 def test_a_line_of_json_a_command_and_a_table_of_all(small_dataset: Dataset, tmp_path: Path, capsys):
-    words = ("hold", small_dataset.folder, "--dry-run", "--controller", "fixed", "--set", "force_n=9", "--json")
+    words = (
+        "hold",
+        small_dataset.folder,
+        "--gripper",
+        "dry-run",
+        "--controller",
+        "fixed",
+        "--set",
+        "force_n=9",
+        "--json",
+    )
     assert run(*words, "--ceiling", "3.5", "-o", tmp_path / "held") == 0
     captured = capsys.readouterr()
     steps = [json.loads(line) for line in captured.out.splitlines() if line.startswith("{")]
@@ -27,5 +37,5 @@ def test_frames_of_another_sensor_are_told_once(small_dataset: Dataset, differen
     profile = tmp_path / "tip.toml"
     profile.write_text('name = "another"\n', encoding="utf-8")
     words = ("hold", small_dataset.folder, "--network", difference_run, "--engine", "torch", "--sensor", profile)
-    assert run(*words, "--dry-run", "--controller", "fixed") == 0
+    assert run(*words, "--gripper", "dry-run", "--controller", "fixed") == 0
     assert " ".join(capsys.readouterr().err.split()).count("reads frames of another") == 1

@@ -523,8 +523,6 @@ class HoldOptions(TypedDict, total=False):
     network: str
     """Network for the sources; for `grip` that of the package if not given."""
 
-    dry_run: bool
-    """Send nothing: print what would be sent, as if it were obeyed at once."""
     messages: str
     """Messages of a ROS 2 gripper: gripper-command (default) or controllers."""
     joint: str
@@ -575,9 +573,7 @@ def call_hold(call: Any, source: str, **options: Unpack[HoldOptions]) -> None:
     from sliplens.recordings.sensor import load_profile
 
     arguments = call.keywords
-    gripper = "dry-run" if options.get("dry_run") else arguments.get("gripper")
-    if gripper is None:
-        raise InputError("no gripper is given; name one with --gripper, or see what would be sent with --dry-run")
+    gripper = arguments["gripper"]
     make_controller(arguments.get("controller", "margin"), arguments.get("settings"))  # refused before a network loads
     names = [name for name in (source, options.get("second")) if name is not None]
     reference, sensor = options.get("reference", ()), options.get("sensor")

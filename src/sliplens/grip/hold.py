@@ -67,7 +67,7 @@ class HoldStep(GripCommand):
 
 def hold_grip(
     readers: LiveReader | Sequence[LiveReader],
-    gripper: Gripper | str = "dry-run",
+    gripper: Gripper | str,
     *,
     controller: str | Controller = "margin",
     settings: Mapping[str, float] | None = None,
