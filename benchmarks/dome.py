@@ -40,10 +40,9 @@ from sliplens.markers.tracker import Tracker
 from sliplens.recordings import import_recordings
 from sliplens.recordings.formats.tables import open_text_table
 from sliplens.recordings.options import LabelSettings
-from sliplens.simulation.geometry import Dome
 from sliplens.simulation.loading import load_at_states, move_markers
 from sliplens.simulation.nuisances import Grasp
-from sliplens.simulation.sensor import CHROMATOUCH
+from sliplens.simulation.sensor import CHROMATOUCH, Dome
 from sliplens.training import evaluate, train
 
 LIGHT_G, HEAVY_G = 135.6, 584.2

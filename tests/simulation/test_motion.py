@@ -9,9 +9,9 @@ import pytest
 from sliplens.errors import ContactError
 from sliplens.mechanics import contact_radius, reduced_modulus, stick_ratio
 from sliplens.simulation import CHROMATOUCH, FLAT_GEL
-from sliplens.simulation.geometry import FlatPad
 from sliplens.simulation.loading import load_at_margins, move_markers
 from sliplens.simulation.nuisances import Grasp
+from sliplens.simulation.sensor import FlatPad
 
 WAYS = [(CHROMATOUCH, "calibrated"), (CHROMATOUCH, "half-space"), (FLAT_GEL, "half-space")]
 CENTRED = Grasp(contact_offset=(0.0, 0.0), shear_direction_rad=0.0)

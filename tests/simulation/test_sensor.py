@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from sliplens.errors import ContactError
 from sliplens.simulation import CHROMATOUCH, FLAT_GEL
-from sliplens.simulation.geometry import Dome, FlatPad
-from sliplens.simulation.sensor import MarkerLook, mix_noise, pick_noise
+from sliplens.simulation.sensor import Dome, FlatPad, MarkerLook, mix_noise, pick_noise
 
 DOME, PAD = cast("Dome", CHROMATOUCH.geometry), cast("FlatPad", FLAT_GEL.geometry)
 

@@ -17,9 +17,9 @@ from sliplens.simulation import (
     simulate_trial,
 )
 from sliplens.simulation.filming import prepare_film
-from sliplens.simulation.geometry import FlatPad
 from sliplens.simulation.loading import load_at_margins
 from sliplens.simulation.nuisances import Day, Grasp
+from sliplens.simulation.sensor import FlatPad
 
 RECIPE = SimulationRecipe(dry_trials=3, wet_trials=1, frames_per_trial=30, seed=5)
 

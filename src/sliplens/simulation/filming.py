@@ -10,10 +10,9 @@ from jaxtyping import Float, Float32, Int, UInt8
 from torch import Tensor
 
 from sliplens.mechanics import normal_slope
-from sliplens.simulation.geometry import Point, Rays, pixel_grid
 from sliplens.simulation.loading import Loading, Motion, move_markers
 from sliplens.simulation.nuisances import Day, Grasp, Nuisances, Unit
-from sliplens.simulation.sensor import Sensor, mix_noise, pick_noise
+from sliplens.simulation.sensor import Point, Rays, Sensor, mix_noise, pick_noise, pixel_grid
 
 Planes: TypeAlias = Float32[np.ndarray, "3 height width"]
 Looks: TypeAlias = Float[np.ndarray, "frames markers 3"]

@@ -17,9 +17,8 @@ from sliplens.mechanics import (
     stick_ratio,
 )
 from sliplens.recordings.trial import ContactState, contact_states
-from sliplens.simulation.geometry import Frames
 from sliplens.simulation.nuisances import Grasp
-from sliplens.simulation.sensor import Sensor
+from sliplens.simulation.sensor import Frames, Sensor
 
 _FALL_S = 0.06  # time in which friction falls from static to kinetic once the contact slips (assumed)
 _SLIP_SHARE = 0.2  # share of a stick-slip cycle in which the contact slips (assumed)
