@@ -1,7 +1,6 @@
-"""Grippers that lie for a while, held by the margin in virtual time; run as a script it prints what they were sent."""
+"""Grippers that lie for a while, held by the margin in virtual time."""
 
 import random
-import sys
 import time
 from collections.abc import Callable
 from contextlib import closing
@@ -111,19 +110,3 @@ def hold(lie: str, controller: str | Controller = "margin") -> LyingHold:
         time_s=time_s, command_n=command_n, acted=acted, force_n=force_n,
         troubles=tuple(troubles), sent=frozenset(line.split()[0] for line in gripper.heard),
     )  # fmt: skip
-
-
-def main() -> None:
-    """Write a row a lie."""
-    for lie in (*LIES, *WIRE):
-        held = hold(lie)
-        lying = (held.time_s >= LIES_S) & (held.time_s < ENDS_S)
-        fell = np.diff(held.command_n, prepend=0.0)[lying & (held.acted < MarginLaw.target)]
-        sys.stdout.write(
-            f"| {lie} | {held.command_n[lying].min():.2f} to {held.command_n[lying].max():.2f} N "
-            f"| {max(0.0, -float(fell.min(initial=0.0))):.2f} N | {held.troubles[0] if held.troubles else 'none'} |\n"
-        )
-
-
-if __name__ == "__main__":
-    main()
