@@ -66,12 +66,9 @@ class LyingGripper(FakeGripper):
 class LyingHold:
     """Commands of a hold, a row each."""
 
-    time_s: np.ndarray
     command_n: np.ndarray
     acted: np.ndarray
     """Margin acted on, or read by a controller of another kind; NaN where none is."""
-    force_n: np.ndarray
-    """Grip force as it is."""
     troubles: tuple[str, ...]
     sent: frozenset[str]
     """First words of all lines."""
@@ -104,9 +101,7 @@ def hold(lie: str, controller: str | Controller = "margin") -> LyingHold:
                     troubles[words] = None
             law = holder.controller
             acted = float(law.acted[0]) if isinstance(law, MarginLaw) else read
-            rows.append((now_s, answer.command_n, acted, gripper.force_n))
-    time_s, command_n, acted, force_n = np.array(rows).T
-    return LyingHold(
-        time_s=time_s, command_n=command_n, acted=acted, force_n=force_n,
-        troubles=tuple(troubles), sent=frozenset(line.split()[0] for line in gripper.heard),
-    )  # fmt: skip
+            rows.append((answer.command_n, acted))
+    command_n, acted = np.array(rows).T
+    sent = frozenset(line.split()[0] for line in gripper.heard)
+    return LyingHold(command_n=command_n, acted=acted, troubles=tuple(troubles), sent=sent)
