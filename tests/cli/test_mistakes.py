@@ -73,7 +73,7 @@ MISTAKES = {
     "live simulated --speed 2": "a simulated chromatouch takes no --speed; leave it out",
     "live nowhere": "nowhere is no source that is known",
     "live DATA --sensor PROFILE --no-page": "the run trained-elsewhere does not exist",
-    "hold grip": "name one with --gripper",
+    "hold grip": "--gripper requires an argument",
     "hold grip --gripper tcp://nowhere": "is no address of a gripper",
     "hold nowhere --gripper dry-run": "nowhere is no source that is known",
     "hold grip:anvil --gripper dry-run": "there is no object named 'anvil'",
