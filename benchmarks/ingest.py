@@ -20,7 +20,6 @@ from PIL import Image
 
 from sliplens.files import scratch_folder
 from sliplens.recordings import Recording, check_dataset, import_recordings
-from sliplens.report.page import write_trials_page
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 _SIZE = 640, 480
@@ -69,7 +68,6 @@ def main() -> None:
         begun, spent = time.perf_counter(), time.process_time()
         data = import_recordings(source, out=scratch / "data", sensor="tip")
         imported = time.perf_counter()
-        write_trials_page(data)
         findings = check_dataset(data)
         ended, spent = time.perf_counter(), time.process_time() - spent
     result = {

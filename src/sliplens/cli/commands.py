@@ -426,7 +426,7 @@ def call_predict(call: Any, *, plot: Path | None = None) -> None:
     Parameters
     ----------
     plot
-        Picture to draw: margin with its interval over time, and label if it is known.
+        Picture to draw: margin with its interval over time of the first trial, and label if it is known.
     """
     if plot is not None:
         from sliplens.plots.style import require_picture_path
@@ -441,12 +441,11 @@ def call_predict(call: Any, *, plot: Path | None = None) -> None:
     if "friction" in call.keywords:
         say(f"margins for the given friction of {call.keywords['friction']}")
     if plot is not None:
-        from sliplens.plots.charts import draw_margins
+        from sliplens.plots.figure import plot as draw
+        from sliplens.plots.style import save_page
 
-        names = [call.keywords[name] for name in ("source", "run") if name in call.keywords]
-        title = ", predicted by ".join(Path(name).name for name in names)
-        trials = draw_margins(predictions.to_arrow(), plot, title=title)
-        print_file(plot, f"margin over time of {number_of(trials, 'trial')}")
+        save_page(draw(predictions), plot)
+        print_file(plot, "margin over time of the first trial")
     if predictions.path is not None:
         print_file(predictions.path, f"{number_of(predictions.frames, 'frame')}, by {predictions.engine}")
 

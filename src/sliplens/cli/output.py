@@ -109,12 +109,9 @@ def draw_audits(data: "Dataset", folder: Path) -> None:
 
 def show_labelled(title: str, data: "Dataset", *, audit: bool) -> None:
     """Draw the pages of a labelled data set, and print what its labels rest on."""
-    from sliplens.report.page import write_trials_page
-
     if audit:
         draw_audits(data, data.folder / "audit")
     _show_labelling(title, data)
-    print_file(write_trials_page(data), "all trials at a glance: margins, friction, flags")
 
 
 def _show_labelling(title: str, data: "Dataset") -> None:
@@ -128,7 +125,7 @@ def _show_labelling(title: str, data: "Dataset") -> None:
         invalid[info.trial] = Counter({reason: count for reason, count in counts.items() if reason != "valid"})
     print_table(title, ("trial", "valid", "mu", "lag, ms", "reference"), rows[:_MOST_ROWS])
     if len(rows) > _MOST_ROWS:
-        say(f"  and {number_of(len(rows) - _MOST_ROWS, 'more trial')}, which the page of all trials shows")
+        say(f"  and {number_of(len(rows) - _MOST_ROWS, 'more trial')}; `sliplens check` names those in doubt")
         invalid = {f"all {len(rows)} trials": sum(invalid.values(), Counter())}
     for line in fold_equal(dict.fromkeys(notes)):
         say(f"  note: {line}")

@@ -2,12 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 from itertools import groupby
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
@@ -15,7 +13,6 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from sliplens.errors import InputError
 from sliplens.explainers.table import EXPLAINERS
 from sliplens.plots import style
 from sliplens.plots.saliency import SIGN_COLOURS, full_colour, overlay_relevance
@@ -24,28 +21,6 @@ from sliplens.results.explanation import BASELINES, Strip
 from sliplens.results.faithfulness import CHANCE, DeletionCurve, RemovalCurve
 
 MARGIN_LABEL = "Safety margin Γ (%)"
-MOST_TRIALS = 6
-"""Trials on one page."""
-
-
-def draw_margins(rows: pa.Table, path: Path, *, title: str) -> int:
-    """Save a page of predictions as .png, .pdf or .svg: a trial a row, at most `MOST_TRIALS`; gives how many.
-
-    `rows` are those of `sliplens.predict`; labels are drawn where they are in the table.
-    """
-    style.require_picture_path(path, example="margins.png")
-    names = rows["trial"].unique().to_pylist()
-    if not names:
-        raise InputError("there is no frame to draw; predict at least one")
-    drawn = names[:MOST_TRIALS]
-    with style.drawing_style():
-        figure = Figure(figsize=(9.0, 0.5 + 2.9 * len(drawn)), layout="constrained")
-        more = "" if len(names) == len(drawn) else f", the first {len(drawn)} of {len(names)} trials"
-        figure.suptitle(f"{title}{more}", x=0.01, ha="left", fontsize=12, fontweight="bold", parse_math=False)
-        for name, ax in zip(drawn, figure.subplots(len(drawn), 1, squeeze=False)[:, 0], strict=True):
-            plot_margins(rows.filter(pc.field("trial") == name), ax=ax)
-    style.save_page(figure, path)
-    return len(drawn)
 
 
 def plot_margins(rows: pa.Table, *, ax: Axes) -> Axes:
