@@ -283,7 +283,6 @@ def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Genera
                 )
                 for method, value in spearman.items()
             },
-            neutral_reliability=0.9,
             pairs=400,
             meta=(test,),
             effects=MarkerEffects.joined(tables),

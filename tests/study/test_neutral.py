@@ -8,7 +8,6 @@ from sliplens.study.neutral import (
     draw_groups,
     marker_sums,
     neutral_frame,
-    split_half_reliability,
 )
 
 MARKERS = 40
@@ -44,22 +43,3 @@ def test_relevance_is_summed_by_marker():
     relevance = np.array([[1.0, 2.0, 8.0], [4.0, 8.0, -1.0], [8.0, 8.0, 8.0]])
     sums = marker_sums(relevance, regions, markers=2)
     np.testing.assert_array_equal(sums, [3.0, 3.0])
-
-
-def test_the_reliability_is_the_correlation_with_scores_by_other_groups(rng):
-    frames, maps = 60, 6
-    truth = rng.normal(size=(frames, MARKERS))
-    noise = np.linspace(0, 3, maps)
-    values = {f"{level:.1f}": list(truth + level * rng.normal(size=truth.shape)) for level in noise}
-
-    def scores(seed: int):
-        drawn = [draw_groups(MARKERS, rng=np.random.default_rng((seed, frame))) for frame in range(frames)]
-        effects = [one[members].sum(axis=1) for one, members in zip(truth, drawn, strict=True)]
-        score = [
-            correlate_groups(*row) for of_map in values.values() for row in zip(of_map, drawn, effects, strict=True)
-        ]
-        return np.array(score), split_half_reliability(values, drawn, effects)
-
-    (first, reliability), (second, _) = scores(1), scores(2)
-    assert reliability == pytest.approx(np.corrcoef(first, second)[0, 1], abs=0.08)
-    assert split_half_reliability({}, [], []) is None

@@ -293,7 +293,6 @@ def score_deletion(
         source=explanation.source,
         fill=fill,
         steps=steps,
-        pixels_per_step=int(removed[0]),
         methods=methods,
         alarms=tuple(alarms),
         table=DeletionTable.joined(tables),

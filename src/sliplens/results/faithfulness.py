@@ -83,7 +83,6 @@ class Deletion(Result):
 
     fill: str
     steps: int
-    pixels_per_step: int
     methods: dict[str, MethodScore]
     alarms: tuple[str, ...]
 

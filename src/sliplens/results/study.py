@@ -244,9 +244,6 @@ class Truth(OfNetwork):
 
     frames: int
     methods: dict[str, Localisation]
-    neutral_reliability: float | None
-    """Expected correlation of `Localisation.neutral` by map and frame with that by as many other groups (split half,
-    Spearman-Brown)."""
     pairs: int
     """Pairs of scenes drawn for the Shapley values of each frame."""
     meta: tuple[MetaTest, ...]
@@ -255,10 +252,8 @@ class Truth(OfNetwork):
 
     @property
     def summary(self) -> str:
-        """How many frames and scenes were drawn, and how sure the main judge is."""
-        drawn = f"{number_of(self.frames, 'frame')}, {self.pairs} pairs of scenes each"
-        sure = "unknown" if self.neutral_reliability is None else f"{self.neutral_reliability:.2f}"
-        return f"{drawn}; expected correlation of the neutral scores with a second measurement: {sure}"
+        """How many frames and scenes were drawn."""
+        return f"{number_of(self.frames, 'frame')}, {self.pairs} pairs of scenes each"
 
 
 RECORDS: dict[str, type] = {

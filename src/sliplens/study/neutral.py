@@ -1,6 +1,5 @@
 """Markers moved to another margin of their trial: a neutral judge of maps, and the proof of one."""
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -54,30 +53,6 @@ def correlate_groups(
     if len(effects) < 2 or np.ptp(effects) == 0:
         return float("nan")
     return 0.0 if np.ptp(sums) == 0 else float(np.corrcoef(sums, effects)[0, 1])
-
-
-def split_half_reliability(
-    values: Mapping[str, Sequence[Float[np.ndarray, " markers"]]],
-    groups: Sequence[Int[np.ndarray, "groups members"]],
-    effects: Sequence[Float[np.ndarray, " groups"]],
-) -> float | None:
-    """Expected correlation of the scores of maps and frames with those by as many other groups; None if undefined.
-
-    Scores by every second group are correlated with those by the others; Spearman and Brown's formula gives that of
-    all groups.
-    """
-    halves = np.array(
-        [
-            [correlate_groups(of_frame, some[half::2], changes[half::2]) for half in (0, 1)]
-            for of_map in values.values()
-            for of_frame, some, changes in zip(of_map, groups, effects, strict=True)
-        ]
-    ).reshape(-1, 2)
-    first, second = halves[np.isfinite(halves).all(axis=1)].T
-    if len(first) < 3 or np.ptp(first) == 0 or np.ptp(second) == 0:
-        return None
-    half = max(0.0, float(np.corrcoef(first, second)[0, 1]))
-    return 2 * half / (1 + half)
 
 
 RANDOM_SETS = 20

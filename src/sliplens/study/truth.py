@@ -34,7 +34,6 @@ from sliplens.study.neutral import (
     draw_groups,
     marker_sums,
     neutral_frame,
-    split_half_reliability,
 )
 from sliplens.study.stages import MakeRecord, Stage
 
@@ -365,7 +364,6 @@ class JudgingByTruth(Stage[Truth]):
             source=explained.source,
             frames=len(frames),
             methods=_judge(judged, frames, along, neutral, explained.clusters, seed=seed),
-            neutral_reliability=split_half_reliability(values, groups, moved),
             pairs=pairs,
             meta=meta_test(effects, interval),
             effects=MarkerEffects.joined([_tabulate(*pair) for pair in zip(frames, effects, strict=True)]),
