@@ -210,8 +210,8 @@ class LiveReader(FrameReader):
         if self._threads:
             raise InputError("a reader reads once; make another one of the same source")
         with ExitStack() as stack:
-            _limit_threads(self)
             stack.callback(_free_threads, self)
+            _limit_threads(self)
             stack.callback(self._end_outputs)
             stack.enter_context(self.source)
             if self._forces is not None:
