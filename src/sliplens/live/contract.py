@@ -29,11 +29,8 @@ class LiveOptions:
     """Height and width that a network was trained on, in pixels: used where the source can give it, else ignored."""
 
     def __post_init__(self) -> None:
-        for name, value in (
-            ("rate", self.rate_hz),
-            ("speed", self.speed),
-            *(("size", side) for side in self.size or ()),
-        ):
+        least = {"rate": self.rate_hz, "speed": self.speed, "size": min(self.size or (1,))}
+        for name, value in least.items():
             if value is not None and not value > 0:
                 raise InputError(f"--{name} must be positive, got {value:g}")
 
@@ -41,8 +38,7 @@ class LiveOptions:
         """Refuse options that do not apply to a source."""
         for name, value in vars(self).items():
             if value is not None and name not in (*names, "fit_size"):
-                option = name.removesuffix("_hz").replace("_", "-")
-                raise InputError(f"{what} takes no --{option}; leave it out")
+                raise InputError(f"{what} takes no --{name.removesuffix('_hz')}; leave it out")
 
 
 class LiveSource(ABC):

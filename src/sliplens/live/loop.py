@@ -260,11 +260,7 @@ class LiveReader(FrameReader):
         """
         if not self._threads:
             raise InputError("nothing is read yet; enter the reader first, with `with reader:`")
-        with self._news:  # from now on, not from the first `next`; the newest reading counts as news
-            count = max(0, self._published - 1)
-        return self._follow_news(count)
-
-    def _follow_news(self, count: int) -> Iterator[Reading]:
+        count = max(0, self._published - 1)  # the newest reading counts as news
         while True:
             with self._news:
                 while self._published == count and not self._over.is_set():
