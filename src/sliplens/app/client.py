@@ -67,8 +67,6 @@ class Client:
         self.explained: Map | None = None
         """Map of the frozen picture."""
         self.shows_map = self.shows_arrows = True
-        self.answered = 0
-        """Messages that it has drawn."""
         self._waiting = ""
         """Work in progress for this client, in words."""
         self._notices: deque[str] = deque(maxlen=4)
@@ -117,7 +115,6 @@ class Client:
         """Take an answer, or do what a button asks for; what takes long is not begun twice at once."""
         if command.act == "drawn":
             self._unanswered.discard(command.serial)
-            self.answered += 1
             self._changed.set()
         elif command.act not in self._running:
             self._running[command.act] = task = asyncio.create_task(self._act(command))
