@@ -30,8 +30,8 @@ _CHANGED_SHARE, _NOISE_SHARE, _LEAST_SQUARE = 1.5, 0.2, 0.02
 that rounding makes, in squared grey levels."""
 
 
-Measured = tuple[float, str]
-"""Value of a check, and a sentence that states it."""
+Measured = float | tuple[float, str] | None
+"""Value of a check, with a sentence if `CheckKind.sentence` is not enough; None where there is nothing to measure."""
 
 
 class HealthMonitor:
@@ -100,27 +100,17 @@ class HealthMonitor:
         """Make some checks; returns the newest of each."""
         for name in names:
             measure = CHECKS[name].measure
-            if measure is None or (measured := measure(self, frame)) is None:
-                self._last.pop(name, None)
-            else:
-                self._last[name] = frame.time_s, make_check(name, *measured)
+            self._last.pop(name, None)
+            if measure is not None and (measured := measure(self, frame)) is not None:
+                value, sentence = measured if isinstance(measured, tuple) else (measured, None)
+                self._last[name] = frame.time_s, make_check(name, value, sentence)
         made = [self._last[name] for name in CHECKS if name in self._last]
         return tuple(replace(check, age_s=frame.time_s - then_s) for then_s, check in made)
 
     def _repeated(self, frame: LiveFrame) -> Measured:
         if self._before is None or not np.array_equal(frame.small, self._before):
             self._before, self._changed_s = frame.small.copy(), frame.time_s
-        value = max(0.0, frame.time_s - self._changed_s)  # a camera's noise never repeats
-        return value, f"the picture has not changed by a single pixel for {value:.2g} s"
-
-    def _halves(self, _: LiveFrame) -> Measured:
-        ratio = self._stillness.ratio
-        return ratio, f"one half of the picture changes {ratio:.2g} times as much as the other"
-
-    def _frozen(self, _: LiveFrame) -> Measured | None:
-        if (change_n := self._stillness.force_change_n) is None:
-            return None
-        return change_n, f"the force changed by {change_n:.2g} N while the picture showed nothing but noise"
+        return max(0.0, frame.time_s - self._changed_s)  # a camera's noise never repeats
 
     def _drops(self, frame: LiveFrame) -> Measured:
         numbers = self._numbers
@@ -128,13 +118,7 @@ class HealthMonitor:
         while frame.time_s - numbers[0][0] > _DROPS_OVER_S or frame.number < numbers[0][1]:
             numbers.popleft()
         span = numbers[-1][1] - numbers[0][1]
-        value = max(0.0, 1 - (len(numbers) - 1) / span) if span > 0 else 0.0
-        return value, f"{value:.0%} of the frames of the last second were lost"
-
-    def _late(self, frame: LiveFrame) -> Measured:
-        captured_s = frame.captured_s
-        value = max(0.0, time.monotonic() - captured_s) if captured_s > 0 else 0.0
-        return value, f"the frame is {value:.2g} s old"
+        return max(0.0, 1 - (len(numbers) - 1) / span) if span > 0 else 0.0
 
     def _exposure(self, _: LiveFrame) -> Measured:
         return abs(self._gain), f"the picture is {2**self._gain:.2g} times as bright as the reference"
@@ -142,10 +126,6 @@ class HealthMonitor:
     def _touch(self, _: LiveFrame) -> Measured:
         change = f"the picture differs by {self._change:.2g} grey levels from the untouched sensor"
         return self._change, "nothing touches the sensor" if self._change < LEAST_TOUCH else change
-
-    def _saturation(self, frame: LiveFrame) -> Measured:
-        value = max(0.0, _saturated_share(frame.small) - self._saturated)
-        return value, f"{value:.0%} of the picture have turned black or white"
 
     def _focus(self, frame: LiveFrame) -> Measured:
         share = _sharpness(_green(frame.small)) / 2**self._gain / max(self._sharpness, 1e-3)
@@ -177,7 +157,7 @@ class HealthMonitor:
         worst = float(np.abs(np.add(*middle) / 2).max(initial=0.0))
         return worst, f"one side of the picture is {2**worst:.2g} times brighter or darker than in the reference"
 
-    def _absent_markers(self, _: LiveFrame) -> Measured | None:
+    def _absent_markers(self, _: LiveFrame) -> Measured:
         """Measure the share of the reference's markers that are not where they should be."""
         if self._markers is None:
             return None
@@ -185,16 +165,16 @@ class HealthMonitor:
         if (status == MarkerStatus.LOST).any():
             return 1.0, "the pattern of the markers has jumped, and none can be told from the next"
         absent = np.isin(status, (MarkerStatus.MISSING, MarkerStatus.BROKEN))
-        value = float(absent.sum() / max(1, (absent | (status == MarkerStatus.FOLLOWED)).sum()))
-        return value, f"{value:.0%} of the markers are not seen where they should be"
+        return float(absent.sum() / max(1, (absent | (status == MarkerStatus.FOLLOWED)).sum()))
 
 
-def make_check(name: str, value: float, sentence: str, *, cure: str | None = None) -> Check:
+def make_check(name: str, value: float, sentence: str | None = None, *, cure: str | None = None) -> Check:
     """Compare a value with its limit in `CHECKS`; a check that fails states its cure."""
     kind = CHECKS[name]
     limit = kind.limit
     ok = value >= limit if kind.is_minimum else value <= limit
     cure = kind.cure if cure is None else cure
+    sentence = kind.sentence.format(value) if sentence is None else sentence
     return Check(name=name, value=value, limit=limit, ok=ok, sentence=sentence if ok else f"{sentence}; {cure}")
 
 
@@ -202,8 +182,10 @@ def make_check(name: str, value: float, sentence: str, *, cure: str | None = Non
 class CheckKind:
     """Row of `CHECKS`: what one check measures, its limit and its cure."""
 
-    measure: Callable[[HealthMonitor, LiveFrame], Measured | None] | None = None
-    """Measures a frame; returns None where there is nothing to measure. None of a check of the network."""
+    measure: Callable[[HealthMonitor, LiveFrame], Measured] | None = None
+    """Measures a frame; None of a check of the network."""
+    sentence: str = ""
+    """Statement of a value."""
     limit: float
     """Bound of healthy values, in the unit of `unit`: seconds, newtons, pixels, grey levels, or a ratio."""
     unit: str
@@ -216,18 +198,31 @@ class CheckKind:
 
 _RESTART = "start the camera again"
 CHECKS = {
-    "repeated": CheckKind(measure=HealthMonitor._repeated, limit=0.25, unit="s", cure=_RESTART, harm=(0.92, 1.06)),
-    "halves": CheckKind(measure=HealthMonitor._halves, limit=4.0, unit="ratio", cure=_RESTART, harm=(0.15, 0.02)),
-    "frozen": CheckKind(measure=HealthMonitor._frozen, limit=0.15, unit="N", cure=_RESTART, harm=(0.91, 0.56)),
+    "repeated": CheckKind(
+        measure=HealthMonitor._repeated, limit=0.25, unit="s", cure=_RESTART, harm=(0.92, 1.06),
+        sentence="the picture has not changed by a single pixel for {:.2g} s",
+    ),
+    "halves": CheckKind(
+        measure=lambda health, _: health._stillness.ratio, limit=4.0, unit="ratio", cure=_RESTART, harm=(0.15, 0.02),
+        sentence="one half of the picture changes {:.2g} times as much as the other",
+    ),
+    "frozen": CheckKind(
+        measure=lambda health, _: health._stillness.force_change_n, limit=0.15, unit="N", cure=_RESTART,
+        harm=(0.91, 0.56), sentence="the force changed by {:.2g} N while the picture showed nothing but noise",
+    ),
     "late": CheckKind(
-        measure=HealthMonitor._late, limit=0.5, unit="s", cure="close what else uses the processor, or lower --rate"
+        measure=lambda _, frame: max(0.0, time.monotonic() - frame.captured_s) if frame.captured_s > 0 else 0.0,
+        limit=0.5, unit="s", cure="close what else uses the processor, or lower --rate",
+        sentence="the frame is {:.2g} s old",
     ),
     "drops": CheckKind(
-        measure=HealthMonitor._drops, limit=0.8, unit="share", cure="lower --rate or --size, or use another port"
+        measure=HealthMonitor._drops, limit=0.8, unit="share", cure="lower --rate or --size, or use another port",
+        sentence="{:.0%} of the frames of the last second were lost",
     ),
     "saturation": CheckKind(
-        measure=HealthMonitor._saturation, limit=0.06, unit="share", cure="mend the exposure or the lamps",
-        harm=(0.16, 0.36),
+        measure=lambda health, frame: max(0.0, _saturated_share(frame.small) - health._saturated), limit=0.06,
+        unit="share", cure="mend the exposure or the lamps", harm=(0.16, 0.36),
+        sentence="{:.0%} of the picture have turned black or white",
     ),
     "exposure": CheckKind(
         measure=HealthMonitor._exposure, limit=0.2, unit="powers of 2",
@@ -246,6 +241,7 @@ CHECKS = {
     ),
     "markers": CheckKind(
         measure=HealthMonitor._absent_markers, limit=0.15, unit="share", harm=(0.33, 1.18),
+        sentence="{:.0%} of the markers are not seen where they should be",
         cure="clean the skin and the lens, let go, and take a new reference",
     ),
     "touch": CheckKind(
