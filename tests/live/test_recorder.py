@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 import pyarrow as pa
@@ -308,10 +309,17 @@ def samples_of(stream: ForceStream, count: int, *, time_s: float, captured_s: fl
     return forces
 
 
-def test_samples_keep_their_steps_on_the_clock_of_the_frames(tmp_path: Path):
-    path = tmp_path / "forces.csv"
-    path.write_text("# a logger\ntime [ms];fx [mN];fy [mN];fz [mN]\n5;1;1;1\n")
+@contextmanager
+def streamed(path: Path, header: str) -> Iterator[tuple[ForceStream, TextIO]]:
+    """Stream a file that begins with a header, beside the file to write on."""
+    path.write_text(header)
     with ForceStream(path) as stream, path.open("a", buffering=1) as file:
+        yield stream, file
+
+
+def test_samples_keep_their_steps_on_the_clock_of_the_frames(tmp_path: Path):
+    header = "# a logger\ntime [ms];fx [mN];fy [mN];fz [mN]\n5;1;1;1\n"
+    with streamed(tmp_path / "forces.csv", header) as (stream, file):
         begun_s = time.monotonic()
         file.write("7000;0;0;1500\n7010;250;0;1500\n7030;500;0;15")
         file.flush()
@@ -327,9 +335,7 @@ def test_samples_keep_their_steps_on_the_clock_of_the_frames(tmp_path: Path):
 
 
 def test_samples_without_times_count_from_when_they_arrive(tmp_path: Path):
-    path = tmp_path / "forces.csv"
-    path.write_text("fn,ft\n")
-    with ForceStream(path) as stream, path.open("a", buffering=1) as file:
+    with streamed(tmp_path / "forces.csv", "fn,ft\n") as (stream, file):
         begun_s = time.monotonic()
         file.write("2.0,0.5\n")
         forces = samples_of(stream, 1, time_s=begun_s, captured_s=begun_s)
@@ -338,9 +344,7 @@ def test_samples_without_times_count_from_when_they_arrive(tmp_path: Path):
 
 
 def test_samples_that_drop_out_or_come_late_are_left_out(tmp_path: Path):
-    path = tmp_path / "forces.csv"
-    path.write_text("time_s,fx,fy,fz\n")
-    with ForceStream(path) as stream, path.open("a", buffering=1) as file:
+    with streamed(tmp_path / "forces.csv", "time_s,fx,fy,fz\n") as (stream, file):
         file.write("1.0,0,0,1\n1.2,nan,0,1\n1.4,0,0,3\n1.1,0,0,9\n1.3,0,0,9\n1.5,0,0,4\n")
         forces = samples_of(stream, 6, time_s=0.0, captured_s=0.0)
         np.testing.assert_array_equal(forces.force_n[:, 2], [1, 3, 4])
@@ -361,19 +365,16 @@ def test_a_named_pipe_is_read_too(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("lines", "words"),
+    ("header", "lines", "words"),
     [
-        ("a,b\n", "has no columns that look like forces"),
-        ("time_s,fx,fy,fz\n1,2\n", "has a line of 2 columns, 4 are named"),
-        ("time_s,fx,fy,fz\n1,2,3,x\n", "could not convert"),
+        ("a,b\n", "", "has no columns that look like forces"),
+        ("time_s,fx,fy,fz\n", "1,2\n", "has a line of 2 columns, 4 are named"),
+        ("time_s,fx,fy,fz\n", "1,2,3,x\n", "could not convert"),
     ],
 )
-def test_lines_that_are_no_forces_are_told(tmp_path: Path, lines: str, words: str):
-    path = tmp_path / "forces.csv"
-    header, *rest = lines.splitlines(keepends=True)
-    path.write_text(header)
-    with ForceStream(path) as stream, path.open("a", buffering=1) as file:
-        file.writelines(rest)
+def test_lines_that_are_no_forces_are_told(tmp_path: Path, header: str, lines: str, words: str):
+    with streamed(tmp_path / "forces.csv", header) as (stream, file):
+        file.write(lines)
         wait_until(lambda: stream.trouble)
     assert words in str(stream.trouble)
     assert "the forces of" in str(stream.trouble)
