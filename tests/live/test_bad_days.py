@@ -19,8 +19,7 @@ from PIL import Image
 
 import sliplens as sl
 from sliplens.errors import InputError, SourceError
-from sliplens.images import write_png
-from sliplens.live import FolderSource, LiveOptions, StreamSource, list_cameras, loop, open_live, sources
+from sliplens.live import LiveOptions, StreamSource, list_cameras, loop, open_live, sources
 from sliplens.live.contract import LiveSource
 from sliplens.live.reading import LiveFrame, Reading
 
@@ -157,61 +156,6 @@ def test_a_clock_that_jumps_withholds_one_frame(jump_s: float):
     # a clock that tells nothing withholds all
     assert [bool(reading.withheld) for reading in readings] == [False, False, True, bool(np.isnan(jump_s))]
     assert "the clock of the fake jumped by" in str(readings[2].withheld)
-
-
-# a growing folder
-
-
-def test_a_folder_gives_its_newest_image_and_those_to_come(tmp_path: Path):
-    for number in (1, 2, 10):
-        write_png(tmp_path / f"{number}.png", np.full((8, 6, 3), number, dtype=np.uint8))
-    with open_live(tmp_path) as source:
-        assert (source.name, source.size) == (f"the folder {tmp_path}", (8, 6))
-        frames = source.frames()
-        assert next(frames).image[0, 0, 0] == 10
-        write_png(tmp_path / "11.png", np.full((8, 6, 3), 11, dtype=np.uint8))
-        grown = next(frames)
-        assert (grown.number, grown.image[0, 0, 0]) == (1, 11)
-        source.close()
-        assert list(frames) == []
-
-
-def test_an_image_that_is_half_written_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(sources, "_WRITTEN_S", 60.0)  # however late the rest comes
-    write_png(tmp_path / "1.png", IMAGE)
-    whole = (tmp_path / "1.png").read_bytes()
-    with FolderSource(tmp_path) as source:
-        frames = source.frames()
-        next(frames)
-        (tmp_path / "2.png").write_bytes(whole[:200])
-        end = Thread(target=lambda: (time.sleep(0.1), (tmp_path / "2.png").write_bytes(whole)))
-        end.start()
-        np.testing.assert_array_equal(next(frames).image, IMAGE)
-        end.join()
-
-
-def test_an_image_that_stays_damaged_is_missing_in_the_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(sources, "_WRITTEN_S", 0.05)
-    write_png(tmp_path / "1.png", IMAGE)
-    with FolderSource(tmp_path) as source:
-        frames = source.frames()
-        next(frames)
-        (tmp_path / "2.png").write_bytes(b"no image")
-        write_png(tmp_path / "3.png", IMAGE)
-        assert next(frames).number == 2
-
-
-def test_a_folder_that_is_removed_is_told(tmp_path: Path):
-    folder = tmp_path / "frames"
-    folder.mkdir()
-    write_png(folder / "1.png", IMAGE)
-    with FolderSource(folder) as source:
-        frames = source.frames()
-        next(frames)
-        (folder / "1.png").unlink()
-        folder.rmdir()
-        with pytest.raises(SourceError, match=r"cannot be read .*; make it again, and begin anew"):
-            next(frames)
 
 
 # a network stream

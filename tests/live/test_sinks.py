@@ -3,7 +3,6 @@
 import base64
 import io
 import json
-import socket
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
@@ -37,16 +36,6 @@ IMAGE = np.full((8, 12, 3), (200, 100, 50), dtype=np.uint8)
 def same(image: np.ndarray) -> bool:
     """Whether it is the frame, but for what JPEG loses of a plain colour."""
     return image.shape == IMAGE.shape and bool(np.abs(image.astype(int) - IMAGE).max() <= 3)
-
-
-def test_a_datagram_is_a_reading():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
-        listener.bind(("127.0.0.1", 0))
-        listener.settimeout(10)
-        sink = open_sink(f"udp:127.0.0.1:{listener.getsockname()[1]}")
-        sink.send(READING, IMAGE)
-        sink.close()
-        assert msgspec.json.decode(listener.recv(65536), type=Reading) == READING
 
 
 def test_an_mcap_file_is_read_by_mcap(tmp_path: Path):
@@ -203,8 +192,6 @@ def test_a_sink_that_breaks_off_says_so_and_the_reading_goes_on(slow: Slow):
 @pytest.mark.parametrize(
     ("name", "told"),
     [
-        ("udp", "names no port; give udp:HOST:PORT"),
-        ("udp:robot", "names no port"),
         ("mcap", "writes a file that ends in .mcap; give mcap:grip.mcap"),
         ("mcap:nowhere/grip.mcap", "the folder nowhere does not exist"),
         ("rerun:grip.txt", "ends in .rrd"),

@@ -120,8 +120,8 @@ def call_live(
     list_sources
         List the cameras and the other sources, and end.
     sink
-        Where readings go: json (lines on standard output), udp:HOST:PORT, mcap:FILE (for Foxglove), rerun:FILE,
-        zenoh:KEY (to ROS 2). Without one, a line a second is printed.
+        Where readings go: json (lines on standard output), mcap:FILE (for Foxglove), rerun:FILE, zenoh:KEY
+        (to ROS 2). Without one, a line a second is printed.
     page
         Serve a page with buttons to freeze, explain and record.
     host

@@ -10,7 +10,6 @@ from sliplens.live.slip import SlipDetector
 from sliplens.live.sources import (
     SOURCES,
     CameraSource,
-    FolderSource,
     ReplaySource,
     SimulatedSource,
     StreamSource,
@@ -19,7 +18,7 @@ from sliplens.live.sources import (
 )
 
 __all__ = [
-    "SOURCES", "CameraSource", "Check", "FolderSource", "ForceStream", "HealthMonitor",
+    "SOURCES", "CameraSource", "Check", "ForceStream", "HealthMonitor",
     "Latency", "LiveFrame", "LiveOptions", "LiveReader", "LiveSource", "MarkerReading", "Outlet", "Reading",
     "Recorder", "ReplaySource", "SimulatedSource", "SlipDetector", "SlipState", "SourceKind",
     "StreamSource", "list_cameras", "open_live", "read_live",

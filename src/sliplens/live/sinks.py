@@ -1,12 +1,10 @@
-"""Sinks of readings: JSON lines, datagrams, MCAP, Rerun, ROS 2 over Zenoh."""
+"""Sinks of readings: JSON lines, MCAP, Rerun, ROS 2 over Zenoh."""
 
-import errno
 import itertools
 import json
 import os
 import re
 import secrets
-import socket
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -68,34 +66,6 @@ def _open_json(address: str) -> Sink:
         sys.stdout.buffer.flush()
 
     return Sink(send)
-
-
-_TRANSIENT = (
-    errno.EAGAIN, errno.ECONNREFUSED, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN, errno.ENOBUFS,
-)  # fmt: skip
-"""Errors at which a datagram is lost and the next, newer one is sent: no listener, a full buffer, no network."""
-
-
-def _open_udp(address: str) -> Sink:
-    host, _, port = address.rpartition(":")
-    host = host.strip("[]") or "127.0.0.1"
-    if not port.isdecimal() or not 0 < int(port) <= 65535:
-        raise InputError(f"--sink udp:{address} names no port; give udp:HOST:PORT, as udp:127.0.0.1:9870")
-    try:
-        [(family, kind, protocol, _, target), *_] = socket.getaddrinfo(host, int(port), type=socket.SOCK_DGRAM)
-    except socket.gaierror as error:
-        raise InputError(f"--sink udp: {host} is not known ({error.strerror}); give an address") from None
-    outgoing = socket.socket(family, kind, protocol)
-    outgoing.setblocking(False)
-
-    def send(reading: Reading, _: Frame | None) -> None:
-        try:
-            outgoing.sendto(encode_reading(reading), target)
-        except OSError as error:
-            if error.errno not in _TRANSIENT:
-                raise
-
-    return Sink(send, outgoing.close)
 
 
 READING_TOPIC, IMAGE_TOPIC = "/sliplens/reading", "/sliplens/image"
@@ -366,7 +336,6 @@ SINKS = Table[Callable[[str], Sink]](
     "sliplens.sinks",
     {
         "json": _open_json,
-        "udp": _open_udp,
         "mcap": _open_mcap,
         "rerun": _open_rerun,
         "zenoh": _open_zenoh,

@@ -15,14 +15,12 @@ from av.error import FFmpegError, InvalidDataError
 from av.video.reformatter import VideoReformatter
 from jaxtyping import UInt8
 
-from sliplens.errors import ImageError, InputError, SourceError
+from sliplens.errors import InputError, SourceError
 from sliplens.extras import Table, pick
-from sliplens.files import require_folder
-from sliplens.images import image_size, is_image, list_images, natural_key, read_image
+from sliplens.images import natural_key
 from sliplens.live.contract import LiveOptions, LiveSource, Pace, SourceKind
 from sliplens.live.reading import LiveFrame
 from sliplens.recordings.capture import Capture, Forces
-from sliplens.recordings.formats import recognise
 from sliplens.recordings.formats.video import upright
 from sliplens.recordings.source import open_source
 from sliplens.simulation.filming import prepare_film
@@ -177,62 +175,6 @@ def list_cameras(folder: Path = Path("/sys/class/video4linux")) -> dict[str, str
     """List the cameras of this machine: the name of each by its device file."""
     paths = sorted(folder.glob("video*/name"), key=lambda path: natural_key(path.parent.name))
     return {f"/dev/{path.parent.name}": path.read_text(encoding="utf-8").strip() for path in paths}
-
-
-_FOLDER_S = 0.02
-_WRITTEN_S = 1.0  # after which a file that cannot be read is damaged, not half written
-
-
-class FolderSource(LiveSource):
-    """Folder into which another program saves images; the newest is the first frame.
-
-    An image's time is that of its file.
-    """
-
-    cure = "nothing new was saved there"
-
-    def __init__(self, folder: Path) -> None:
-        self.name, self._folder = f"the folder {folder}", folder
-        self._taken: set[str] = set()
-
-    def open(self, _: ExitStack, /) -> None:
-        """Skip the images that are there, but for the newest."""
-        if not any(map(is_image, require_folder(self._folder, what="the folder").iterdir())):
-            raise InputError(f"{self.name} holds no image yet; begin when the first has been saved there")
-        *before, newest = list_images(self._folder)
-        self.size, self._taken = image_size(newest), {path.name for path in before}
-
-    def frames(self) -> Iterator[LiveFrame]:
-        """Iterate over images in the natural order of their names; a damaged one is missing in the numbers."""
-        last_s, broken_s = -np.inf, np.inf
-        begun = len(self._taken)
-        while not self.closed.wait(_FOLDER_S):
-            try:
-                new = [path for path in self._folder.iterdir() if path.name not in self._taken and is_image(path)]
-            except OSError as error:
-                raise SourceError(
-                    f"{self.name} cannot be read ({error.strerror}); make it again, and begin anew"
-                ) from None
-            for path in sorted(new, key=lambda path: natural_key(path.name)):
-                before = time.monotonic()
-                try:
-                    written_s, image = path.stat().st_mtime, read_image(path)
-                except (ImageError, OSError):
-                    broken_s = min(broken_s, before)
-                    if path.exists() and before - broken_s < _WRITTEN_S:
-                        break  # it may be half written; the next ones wait too, so that they come in order
-                    written_s, image = 0.0, None
-                broken_s = np.inf
-                self._taken.add(path.name)
-                if image is not None:
-                    last_s, now_s = max(written_s, last_s + 1e-6), time.monotonic()
-                    yield LiveFrame(
-                        image=image,
-                        number=len(self._taken) - begun - 1,
-                        time_s=last_s,
-                        captured_s=now_s - max(0.0, time.time() - written_s),
-                        decode_ms=1e3 * (now_s - before),
-                    )
 
 
 class ReplaySource(LiveSource):
@@ -418,14 +360,8 @@ _ROWS = {
         open=lambda name, options: StreamSource(name, size=options.size),
         takes=("size",),
     ),
-    "folder": SourceKind(
-        words="folder into which images are saved",
-        recognises=lambda name: Path(name).is_dir() and recognise(Path(name)) in {None, "images"},
-        open=lambda name, _: FolderSource(Path(name)),
-        takes=(),
-    ),
     "replay": SourceKind(
-        words="video, bag or trial of a data set, replayed",
+        words="video, bag, images or trial of a data set, replayed",
         recognises=lambda name: Path(name).exists(),
         open=lambda name, options: _replay(Path(name), options),
         takes=("rate_hz", "speed", "trial"),
@@ -443,8 +379,8 @@ def open_live(
     Parameters
     ----------
     source
-        `simulated`; the number of a camera; the address of a stream; the path of a video, a bag, a data set, or a
-        folder that grows; or uint8 RGB frames, a `Capture`, or a source.
+        `simulated`; the number of a camera; the address of a stream; the path of a video, a bag, a data set or a folder of
+        images; or uint8 RGB frames, a `Capture`, or a source.
     options
         Options of the source.
 
@@ -477,6 +413,6 @@ def open_live(
 
 
 __all__ = [
-    "SOURCES", "CameraSource", "FolderSource", "ReplaySource", "SimulatedSource", "StreamSource",
+    "SOURCES", "CameraSource", "ReplaySource", "SimulatedSource", "StreamSource",
     "list_cameras", "open_live",
 ]  # fmt: skip
