@@ -379,8 +379,8 @@ def open_live(
     Parameters
     ----------
     source
-        `simulated`; the number of a camera; the address of a stream; the path of a video, a bag, a data set or a folder of
-        images; or uint8 RGB frames, a `Capture`, or a source.
+        `simulated`; the number of a camera; the address of a stream; the path of a video, a bag, a data set, or a
+        folder of images; or uint8 RGB frames, a `Capture`, or a source.
     options
         Options of the source.
 
