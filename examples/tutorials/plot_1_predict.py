@@ -76,7 +76,7 @@ plt.show()
 
 # %%
 # Check the labels before you trust them: the audit page shows the forces after tare, the ratio whose maximum is the
-# friction, the margin with its uncertainty, and all doubts in words.
+# friction, the margin with its uncertainty, and all flags in words.
 write_audits(cups, folder / "audit")
 [page] = (folder / "audit").glob("*.png")
 figure, ax = plt.subplots(figsize=(12, 8.6), layout="constrained")
