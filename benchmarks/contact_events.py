@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, UInt8
 from sliplens.images import soften
 from sliplens.mechanics import stick_ratio
 from sliplens.recordings.capture import Forces
-from sliplens.recordings.labels import measure_motion
+from sliplens.recordings.labels.lag import measure_motion
 from sliplens.recordings.trial import ContactState, contact_states
 from sliplens.simulation import TrialPlan
 from sliplens.simulation.filming import Film

@@ -31,7 +31,8 @@ from contact_events import (
 )
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
-from sliplens.recordings.labels import LARGEST_SIGMA, FoundLabels, LabelSettings, label_trial
+from sliplens.recordings.labels.margin import LARGEST_SIGMA, FoundLabels, label_trial
+from sliplens.recordings.options import LabelSettings
 from sliplens.simulation import SimulationRecipe, plan_trials
 from sliplens.simulation.loading import TRIAL_S
 

@@ -1,7 +1,14 @@
 """How labels were made, with all that can be told and numbers that no rounding keeps."""
 
-from sliplens.recordings.labelling import ForceAxes, Found, LabelBasis, Labelling, Lag, ReferenceChoice
-from sliplens.recordings.labels import FrictionEstimate
+from sliplens.recordings.labelling import (
+    ForceAxes,
+    Found,
+    FrictionEstimate,
+    LabelBasis,
+    Labelling,
+    Lag,
+    ReferenceChoice,
+)
 
 LABELLING = Labelling(
     source="Prüfstand ‰",

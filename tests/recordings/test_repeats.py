@@ -9,7 +9,7 @@ from readers import read_video
 
 from sliplens.images import soften
 from sliplens.recordings import Recording
-from sliplens.recordings.labels import describe_repeats, measure_motion
+from sliplens.recordings.labels.lag import describe_repeats, measure_motion
 
 CODECS = {
     "libx264": ("yuv420p", "mp4"),

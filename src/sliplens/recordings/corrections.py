@@ -16,7 +16,7 @@ from sliplens.recordings import dataset
 from sliplens.recordings.dataset import Dataset, load_dataset, trial_path
 from sliplens.recordings.importing import PARTS, TrialJob, TrialWork, write_trials
 from sliplens.recordings.labelling import Corrections
-from sliplens.recordings.labels import require_inside
+from sliplens.recordings.labels.margin import require_inside
 from sliplens.recordings.manifest import Column, parse_cells, read_csv
 from sliplens.recordings.options import LabelSettings, TrialSettings
 from sliplens.recordings.store import read_first_reference, read_header

@@ -22,8 +22,10 @@ from sliplens.progress import OnProgress, add_note, number_of, open_stage, repor
 from sliplens.recordings import dataset
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import Dataset, LeftOut, TrialInfo, load_dataset, trial_path
-from sliplens.recordings.labelling import Corrections, Labelling, ReferenceChoice
-from sliplens.recordings.labels import Reason, choose_reference, describe_repeats, label_trial, measure_motion
+from sliplens.recordings.labelling import Corrections, Labelling, Reason, ReferenceChoice
+from sliplens.recordings.labels.lag import describe_repeats, measure_motion
+from sliplens.recordings.labels.margin import label_trial
+from sliplens.recordings.labels.reference import choose_reference
 from sliplens.recordings.manifest import ManifestRow, find_rows
 from sliplens.recordings.options import LabelSettings, ReadOptions
 from sliplens.recordings.sensor import SensorProfile, is_profile, load_profile

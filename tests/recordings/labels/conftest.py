@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from sliplens.recordings.capture import Forces
-from sliplens.recordings.labels import ForceAxes, Found, FoundLabels, LabelSettings, label_trial
+from sliplens.recordings.labelling import ForceAxes, Found
 from sliplens.recordings.labels.axes import ContactForces, apply_axes
+from sliplens.recordings.labels.margin import FoundLabels, label_trial
+from sliplens.recordings.options import LabelSettings
 
 FORCE_HZ, FRAME_HZ = 500, 30
 TOUCH_S, PULL_S, SLIP_S, END_S = 0.6, 1.5, 4.5, 5.5

@@ -6,8 +6,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sliplens.errors import RecordingError
-from sliplens.recordings.labels import Found, LabelSettings, infer_axes
-from sliplens.recordings.labels.axes import apply_axes, magnitude
+from sliplens.recordings.labelling import Found
+from sliplens.recordings.labels.axes import apply_axes, infer_axes, magnitude
+from sliplens.recordings.options import LabelSettings
 
 from .conftest import NORMAL_N, SLIP_S, TOUCH_S, Trial
 

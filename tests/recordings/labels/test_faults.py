@@ -8,7 +8,8 @@ import pytest
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
-from sliplens.recordings.labels import Reason, infer_axes
+from sliplens.recordings.labelling import Reason
+from sliplens.recordings.labels.axes import infer_axes
 from sliplens.recordings.labels.faults import screen_forces
 
 from .conftest import PULL_S, SLIP_S, STATIC, Trial

@@ -5,15 +5,9 @@ import numpy as np
 import pytest
 
 from sliplens.errors import RecordingError
-from sliplens.recordings.labels import (
-    ContactForces,
-    Found,
-    FrictionEstimate,
-    ImageMotion,
-    apply_axes,
-    estimate_friction,
-)
-from sliplens.recordings.labels.friction import fit_break
+from sliplens.recordings.labelling import Found, FrictionEstimate
+from sliplens.recordings.labels.axes import ContactForces, apply_axes
+from sliplens.recordings.labels.friction import ImageMotion, estimate_friction, fit_break
 
 from .conftest import SLIP_S, STATIC, Trial
 

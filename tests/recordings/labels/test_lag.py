@@ -6,8 +6,8 @@ import pytest
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
-from sliplens.recordings.labels import Lag, estimate_lag
-from sliplens.recordings.labels.lag import doubt_agreement
+from sliplens.recordings.labelling import Lag
+from sliplens.recordings.labels.lag import doubt_agreement, estimate_lag
 
 from .conftest import FORCE_HZ, FRAME_HZ, Trial
 

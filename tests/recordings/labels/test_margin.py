@@ -5,16 +5,11 @@ import pytest
 
 from sliplens.errors import RecordingError
 from sliplens.recordings import ContactState
-from sliplens.recordings.labels import (
-    FoundLabels,
-    FrictionEstimate,
-    LabelSettings,
-    Lag,
-    Reason,
-    apply_axes,
-    estimate_friction,
-    label_frames,
-)
+from sliplens.recordings.labelling import FrictionEstimate, Lag, Reason
+from sliplens.recordings.labels.axes import apply_axes
+from sliplens.recordings.labels.friction import estimate_friction
+from sliplens.recordings.labels.margin import FoundLabels, label_frames
+from sliplens.recordings.options import LabelSettings
 
 from .conftest import PULL_S, SLIP_S, STATIC, TOUCH_S, Trial, ratio
 

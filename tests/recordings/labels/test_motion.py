@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sliplens.images import soften
-from sliplens.recordings.labels import measure_motion
+from sliplens.recordings.labels.lag import measure_motion
 
 
 @pytest.mark.parametrize("size", [(224, 224), (480, 640), (61, 83), (20, 16)])

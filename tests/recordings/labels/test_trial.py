@@ -7,7 +7,7 @@ import pytest
 from there import there
 
 from sliplens.errors import RecordingError
-from sliplens.recordings.labels import Found, FrictionEstimate, Lag
+from sliplens.recordings.labelling import Found, FrictionEstimate, Lag
 
 from .conftest import SLIP_S, STATIC, Trial
 

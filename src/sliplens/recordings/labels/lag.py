@@ -33,7 +33,7 @@ def describe_repeats(motion: Float[np.ndarray, " frames"], time_s: Float[np.ndar
     Examples
     --------
     >>> import numpy as np
-    >>> from sliplens.recordings.labels import describe_repeats
+    >>> from sliplens.recordings.labels.lag import describe_repeats
     >>> doubled = np.tile([1.0, 0.0], 30)  # every second frame shows nothing new
     >>> describe_repeats(doubled, np.arange(60) / 30).split(";")[0]
     '28 of 60 frames repeat the one before: the camera took about 16 frames a second, and the file says 30'
