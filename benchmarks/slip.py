@@ -20,9 +20,8 @@ from sliplens.errors import SliplensError
 from sliplens.live import SlipDetector, SlipState
 from sliplens.markers import Tracker
 from sliplens.simulation import make_recipe, plan_trials
-from sliplens.simulation.intervention import NOISE_PX
 from sliplens.simulation.plan import TrialPlan
-from sliplens.simulation.trials import prepare_trial
+from sliplens.simulation.trials import NOISE_PX, prepare_trial
 
 FRAMES = 480
 """Of a trial of 8 s: 60 a second."""

@@ -15,8 +15,7 @@ from scipy.stats import spearmanr
 import sliplens as sl
 from sliplens.explainers.table import get_explainer
 from sliplens.simulation import PRESETS, plan_trials
-from sliplens.simulation.intervention import put_markers_back, visible_markers
-from sliplens.simulation.trials import prepare_trial, simulate_trial
+from sliplens.simulation.trials import prepare_trial, put_markers_back, simulate_trial, visible_markers
 
 # %%
 # A trial, and the scene from which any frame can be drawn again with some markers at rest.

@@ -19,14 +19,14 @@ from sliplens.simulation import (
     SimulationRecipe,
 )
 from sliplens.simulation.filming import prepare_film
-from sliplens.simulation.intervention import (
+from sliplens.simulation.loading import load_at_margins
+from sliplens.simulation.nuisances import Day, Grasp
+from sliplens.simulation.plan import read_recipe
+from sliplens.simulation.trials import (
     FilmedTrial,
     put_markers_back,
     rebuild_trial,
 )
-from sliplens.simulation.loading import load_at_margins
-from sliplens.simulation.nuisances import Day, Grasp
-from sliplens.simulation.plan import read_recipe
 
 """Of what is drawn of a marker: half of its patch of 32 pixels, and the rounding of its place."""
 RECIPE = SimulationRecipe(dry_trials=3, wet_trials=1, frames_per_trial=24, seed=5)

@@ -9,7 +9,7 @@ import torch
 import sliplens as sl
 from sliplens.explainers.occlusion import marker_regions
 from sliplens.recordings import Recording
-from sliplens.simulation.intervention import put_markers_back, rebuild_trial, visible_markers
+from sliplens.simulation.trials import put_markers_back, rebuild_trial, visible_markers
 from sliplens.study.neutral import prove_map
 
 

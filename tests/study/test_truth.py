@@ -22,7 +22,7 @@ from sliplens.recordings import Dataset
 from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes
 from sliplens.results.study import Truth
 from sliplens.simulation import CHROMATOUCH, SimulationRecipe
-from sliplens.simulation.intervention import put_markers_back, visible_markers
+from sliplens.simulation.trials import put_markers_back, visible_markers
 from sliplens.study.truth import (
     FrameEffects,
     JudgingByTruth,

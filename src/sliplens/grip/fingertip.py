@@ -22,10 +22,10 @@ from sliplens.models.predictions import LEVEL
 from sliplens.progress import report_each
 from sliplens.results.evaluation import ANSWER, MARGIN
 from sliplens.simulation.filming import Film, prepare_film, see_markers
-from sliplens.simulation.intervention import NOISE_PX
 from sliplens.simulation.loading import load_at_margins, load_at_states
 from sliplens.simulation.nuisances import Day, Nuisances, draw_day, draw_grasp, draw_unit
 from sliplens.simulation.sensor import CHROMATOUCH, Sensor
+from sliplens.simulation.trials import NOISE_PX
 
 _TOUCH_N = 0.02  # force of the lightest touch, as in the simulator's labels
 

@@ -11,7 +11,7 @@ from sliplens.explainers.occlusion import marker_regions
 from sliplens.models import Network
 from sliplens.recordings import Recording
 from sliplens.results.explanation import MovedMarkers
-from sliplens.simulation.intervention import put_markers_back, rebuild_trial, visible_markers
+from sliplens.simulation.trials import put_markers_back, rebuild_trial, visible_markers
 
 GROUPS, GROUP_MARKERS = 24, 5
 """Groups of a frame, and markers of a group."""

@@ -30,7 +30,7 @@ from sliplens.results.explanation import Explanation, Strip
 from sliplens.results.faithfulness import NEW_WEIGHTS, RemovalCurve
 from sliplens.results.study import CONFIG_FILE, QUICK_METHODS, RECORDS, SETTINGS, TABLES, TESTS, Study, StudyConfig
 from sliplens.runner import MakePart, Work, require_executor
-from sliplens.simulation.intervention import rebuild_trial
+from sliplens.simulation.trials import rebuild_trial
 from sliplens.study.choice import (
     LEVELS,
     SCORED_LEVELS,

@@ -27,7 +27,7 @@ from sliplens.results.explanation import ExplainedFrame, Explanation
 from sliplens.results.faithfulness import CHANCE, RemovalCurve, is_control
 from sliplens.results.study import Localisation, MarkerEffects, MetaTest, NeutralScores, Truth
 from sliplens.runner import Part, part
-from sliplens.simulation.intervention import FilmedTrial, put_markers_back, rebuild_trial, visible_markers
+from sliplens.simulation.trials import FilmedTrial, put_markers_back, rebuild_trial, visible_markers
 from sliplens.study.neutral import (
     GROUPS,
     correlate_groups,
