@@ -13,11 +13,10 @@ import pyarrow.parquet as pq
 import pytest
 from counted_parts import Count, CountInThreads, parts
 
-from sliplens.cli import main
 from sliplens.errors import InputError, PartError
 from sliplens.files import hash_file, locked
 from sliplens.progress import reporting
-from sliplens.runner import Part, part, read_status, require_new_table, run_parts, run_table
+from sliplens.runner import Part, part, require_new_table, run_parts, run_table
 
 TITLE = "Counting"
 
@@ -42,7 +41,7 @@ def make(
     **options: object,
 ) -> None:
     with reporting(listener):
-        run_parts(work, parts() if every is None else every, out, title=TITLE, **options)  # pyright: ignore
+        run_parts(work, parts() if every is None else every, out, **options)  # pyright: ignore
 
 
 def content(folder: Path) -> dict[str, str]:
@@ -89,12 +88,10 @@ def test_a_part_that_fails_stops_no_other_and_is_tried_again_by_the_next_call(lo
         make(work, out)
     assert set(raised.value.errors) == {"b", "d"}
     assert work.tries() == dict.fromkeys("abcde", 1)
-    (status,) = read_status(out)
-    assert (status.done, status.parts, status.frames_done, status.frames) == (3, 5, 9, 15)
+    assert len(content(out)) == 3
     make(Count(log=log), out)
     assert sorted(content(out)) == [each.path for each in parts()]
     assert Count(log=log).tries() == {"a": 1, "b": 2, "c": 1, "d": 2, "e": 1}
-    assert read_status(out) == []
 
 
 def test_a_full_disk_ends_the_work(log: Path, out: Path):
@@ -188,23 +185,6 @@ def test_executors_that_cannot_start_are_refused_with_their_cure(log: Path, out:
     monkeypatch.setitem(sys.modules, "ray.exceptions", SimpleNamespace(RayError=OSError))
     with pytest.raises(InputError, match=r"^--on ray has no cluster of Ray \(The current node timed out.*retry$"):
         make(Count(log=log), out, on="ray")
-
-
-def test_the_status_is_counted_from_another_place(log: Path, out: Path, capsys: pytest.CaptureFixture[str]):
-    running: list[bool] = []
-
-    def look(done: int, _: int) -> None:
-        if done == 5:
-            with locked(out):
-                running.append(read_status(out)[0].running)
-            running.append(read_status(out)[0].running)
-            assert main(["status", str(out)]) == 0
-
-    make(Count(log=log), out, listener=look)
-    assert running == [True, False]
-    assert "Counting, --on serial: 1 of 5 parts, 3 of 15 frames" in capsys.readouterr().out
-    with pytest.raises(InputError, match=r"nothing was begun at .*nowhere"):
-        read_status(out.with_name("nowhere"))
 
 
 def test_parts_join_into_a_file_or_remain_a_data_set(log: Path, tmp_path: Path):

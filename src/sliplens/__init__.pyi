@@ -27,7 +27,6 @@ from .recordings.importing import import_recordings as import_recordings
 from .recordings.splits import split_dataset as split_dataset
 from .report.page import write_report as write_report
 from .results.study import StudyConfig as StudyConfig
-from .runner import read_status as read_status
 from .simulation.trials import simulate as simulate
 from .study.explaining import explain as explain
 from .study.run import run_study as run_study

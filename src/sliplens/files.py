@@ -291,17 +291,6 @@ def locked(target: Path) -> Iterator[None]:
         lock.release()
 
 
-def is_locked(target: Path) -> bool:
-    """Return True if a process is writing a target."""
-    if not lock_file(target).exists():
-        return False
-    try:
-        with FileLock(lock_file(target), blocking=False):
-            return False
-    except (Timeout, OSError):
-        return True
-
-
 @contextmanager
 def output_folder(
     target: Path, *, stage: str, config: Any, overwrite: bool = False, resumable: bool = True

@@ -20,10 +20,9 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from contextvars import copy_context
-from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, ClassVar, TypeAlias
@@ -34,12 +33,11 @@ from loky import get_reusable_executor
 from loky.process_executor import BrokenProcessPool
 
 from sliplens._version import __version__
-from sliplens.codec import load_record, open_table, regrouped, save_record, write_tables
+from sliplens.codec import open_table, regrouped, write_tables
 from sliplens.errors import InputError, PartError, SliplensError
 from sliplens.extras import pick, require_packages
 from sliplens.files import (
     hash_json,
-    is_locked,
     lock_file,
     locked,
     output_folder,
@@ -53,8 +51,6 @@ from sliplens.progress import OnProgress, counting, current_reporter, open_stage
 LONGEST = 8192
 """Largest number of frames of a part; a longer trial is divided."""
 _LONGEST_NAME = 200  # of a folder; file systems take 255 bytes
-_STATE = "_parts"  # readers of Parquet data sets skip names that begin with an underscore
-_COMMAND = "the interrupted command"
 _PART = re.compile(r"\d{8}-(\d+)-([0-9a-f]{16})(\.\w+)?")
 _FATAL = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}  # no other part could be written either
 
@@ -127,7 +123,6 @@ def run_parts(
     parts: Sequence[Part],
     folder: Path,
     *,
-    title: str,
     on: str = "serial",
     on_part: Callable[[Part], None] | None = None,
 ) -> None:
@@ -137,8 +132,6 @@ def run_parts(
 
     Parameters
     ----------
-    title
-        Description of the work for `read_status`.
     on
         Row of `EXECUTORS` with its argument: `serial`, `processes`, `processes=4`, `ray`, `ray=ADDRESS`.
     on_part
@@ -170,14 +163,9 @@ def run_parts(
     if missing:
         for draft in folder.glob("trial=*/.*.draft*"):  # of processes that were killed, perhaps while writing
             remove(draft)
-        (folder / _STATE).mkdir(parents=True, exist_ok=True)
-        plan = Status(title=title, parts=len(parts), frames=frames, started_s=time.time(), on=on)
-        save_record(plan, folder / _STATE / "plan.json")
+        folder.mkdir(parents=True, exist_ok=True)
         with executor(work, argument, len(missing)) as pool:
             errors = _run(pool, missing, folder, tally.count, made)
-    if not errors or len(parts) == 1:
-        with suppress(OSError):
-            remove(folder / _STATE)
     for error in errors.values() if len(parts) == 1 else ():
         raise error
     if errors:
@@ -428,7 +416,7 @@ def run_table(
 
     def make(folder: Path) -> pa.Schema:
         with open_stage(title):
-            run_parts(work, parts, folder, title=title, on=on)
+            run_parts(work, parts, folder, on=on)
         return open_table(folder / parts[0].path).schema_arrow
 
     def rows(folder: Path) -> Iterator[pa.Table]:
@@ -482,87 +470,4 @@ def require_new_table(path: Path, *, suffix: str | Sequence[str], overwrite: boo
     require_new_file(path, suffix=suffix, overwrite=overwrite)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Status:
-    """Progress of a work, counted from its parts."""
-
-    title: str
-    on: str
-    """Executor, as in `--on`."""
-    parts: int
-    frames: int
-    """Number of frames of all parts; of maps if each is a part."""
-    started_s: float
-    """Time of the last start, in seconds since 1970."""
-    done: int = 0
-    """Number of parts that exist."""
-    frames_done: int = 0
-    running: bool = False
-    """True if a process is making the result."""
-    frames_per_s: float | None = None
-    """Rate since the last start; None if no part is newer."""
-    ends: str | None = None
-    """Date and time in UTC at which the work ends at that rate (ISO 8601); None if nothing is running."""
-
-
-def read_status(out: Path | str) -> list[Status]:
-    """Return the progress of every incomplete work on a result; empty if it is complete.
-
-    Works from another process or machine while the result is being made.
-
-    Parameters
-    ----------
-    out
-        File or folder that a command is writing.
-
-    Raises
-    ------
-    InputError
-        If nothing of that name was begun.
-
-    See Also
-    --------
-    run_study : A long work whose progress it reports.
-
-    Examples
-    --------
-    >>> from sliplens import read_status
-    >>> for work in read_status("runs/mine/margins"):  # doctest: +SKIP
-    ...     print(work.title, work.done, work.parts, work.ends)
-    Predicting frames (difference) 812 1404 2026-11-23T18:20:11+00:00
-    """
-    out = Path(out)
-    folders = [place for place in (out, partial_folder(out)) if place.exists()]
-    if not folders:
-        raise InputError(f"nothing was begun at {out}; name the file or folder that a command writes")
-    plans = [path for place in folders if place.is_dir() for path in sorted(place.rglob(f"{_STATE}/plan.json"))]
-    running = is_locked(out)
-    return [_read_status(path.parent, running=running) for path in plans]
-
-
-def _read_status(state: Path, *, running: bool) -> Status:
-    plan = load_record(state / "plan.json", Status, command=_COMMAND)
-    made = [
-        (int(match[1]), path.stat().st_mtime)
-        for path in state.parent.glob("trial=*/*")
-        if (match := _PART.fullmatch(path.name)) is not None
-    ]
-    new = [(frames, made_s) for frames, made_s in made if made_s >= plan.started_s]
-    last_s = max((made_s for _, made_s in new), default=plan.started_s)
-    rate = sum(frames for frames, _ in new) / (last_s - plan.started_s) if last_s > plan.started_s else None
-    done = sum(frames for frames, _ in made)
-    ends = None
-    if rate is not None and running:
-        end = datetime.fromtimestamp(last_s, UTC) + timedelta(seconds=(plan.frames - done) / rate)
-        ends = end.isoformat(timespec="seconds")
-    return replace(
-        plan,
-        done=len(made),
-        frames_done=done,
-        running=running,
-        frames_per_s=rate,
-        ends=ends,
-    )
-
-
-__all__ = ["Part", "Status", "Work", "part", "read_status", "run_parts", "run_table"]
+__all__ = ["Part", "Work", "part", "run_parts", "run_table"]

@@ -494,11 +494,6 @@ def call_study(call: Any) -> None:
     output.draw_report(out)
 
 
-command("status", "runner:read_status", "sliplens status runs/mine/margins")(
-    lambda call: output.print_status(Path(call.keywords["out"]), call())
-)
-
-
 @command(
     "grip",
     "grip.episodes:run_episodes",

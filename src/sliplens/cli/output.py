@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Unpack
 
 from sliplens.cli.console import Terminal, print_file, print_table, say
 from sliplens.errors import InputError
-from sliplens.files import RUN_FILE
 from sliplens.progress import fold_equal, number_of, open_stage, report_file, reporting
 
 if TYPE_CHECKING:
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
     from sliplens.report.page import Written
     from sliplens.results.evaluation import Evaluation, RegressionScores
     from sliplens.results.faithfulness import Faithfulness
-    from sliplens.runner import Status
     from sliplens.simulation.plan import RecipeChanges
 
 _MOST_ROWS = 24
@@ -263,20 +261,6 @@ def print_faithfulness(faithfulness: "Faithfulness") -> None:
         )
     for alarm in dict.fromkeys(faithfulness.alarms + (() if deletion is None else deletion.alarms)):
         say(f"  alarm: {alarm}")
-
-
-def print_status(path: Path, works: "Sequence[Status]") -> None:
-    """Print the progress of each work on a result."""
-    if not works:
-        whole = path.is_file() or (path / RUN_FILE).is_file()
-        say(f"{path} is complete" if whole else f"nothing in {path} is divided into parts now")
-    for work in works:
-        frames = f"{work.frames_done:,} of {work.frames:,} frames"
-        say(f"{work.title}, --on {work.on}: {work.done:,} of {work.parts:,} parts, {frames}")
-        if work.frames_per_s is not None:
-            say(f"  {work.frames_per_s:.3g} a second" + (f", done at {work.ends}" if work.ends else ""))
-        if not work.running:
-            say("  not running; give the same command again to continue")
 
 
 def print_grip(result: "Grip") -> None:

@@ -89,7 +89,7 @@ def write_trials(
     left_out: list[LeftOut] = []
     with threadpool_limits(1, user_api="blas"), open_stage(title):
         try:
-            run_parts(work, every, folder / PARTS, title=title, on=on)
+            run_parts(work, every, folder / PARTS, on=on)
         except PartError as error:
             if not error.errors.keys() <= (optional or {}).keys():
                 raise

@@ -76,7 +76,7 @@ class Stage(Work, Generic[Result]):
             make_record = self.prepare()
             sizes = [each.frames for each in every]
             return self.join([make_record(each.item) for each in report_each(every, sizes=sizes)])
-        run_parts(work or self, every, folder, title=self.title, on=on)
+        run_parts(work or self, every, folder, on=on)
         command = "the interrupted command"
         return self.join([load_result(folder / each.path, self.record, command=command) for each in every])
 
