@@ -31,6 +31,8 @@ import numpy as np
 import torch
 from rich.console import Console
 from rich.progress import track
+from scipy.optimize import minimize
+from scipy.special import expit
 from scipy.stats import spearmanr
 from torch import Tensor, nn
 
@@ -115,10 +117,8 @@ def small_copies(frames: Iterable[np.ndarray]) -> np.ndarray:
     for frame in islice(frames, _HORIZON):
         rows, columns = (min(most, size) for most, size in zip(_BLOCKS, frame.shape[:2], strict=True))
         height, width = frame.shape[0] // rows, frame.shape[1] // columns
-        whole = frame[: rows * height, : columns * width]
-        # rows first, which lie in one piece: several times faster than both at once
-        lines = whole.reshape(rows, height, -1).sum(axis=1, dtype=np.uint32)
-        copies.append((lines.reshape(rows, columns, width, 3).sum(axis=2) / (height * width)).astype(np.float32))
+        blocks = frame[: rows * height, : columns * width].reshape(rows, height, columns, width, 3)
+        copies.append(blocks.mean(axis=(1, 3)).astype(np.float32))
     return np.stack(copies) if copies else np.empty((0, *_BLOCKS, 3), dtype=np.float32)
 
 
@@ -360,23 +360,15 @@ def fit_logistic(values: np.ndarray, labels: np.ndarray, weight: np.ndarray) -> 
     """Ridge logistic regression; gives the probability of a slip."""
     middle, scale = values.mean(axis=0), values.std(axis=0) + 1e-9
     terms = np.concatenate([np.ones((len(values), 1)), (values - middle) / scale], axis=1)
-    ridge = np.eye(terms.shape[1]) * _RIDGE
-    ridge[0, 0] = 1e-6
-    at = np.zeros(terms.shape[1])
-    for _ in range(50):
-        chance = 1 / (1 + np.exp(-np.clip(terms @ at, -30, 30)))
-        slope = terms.T @ (weight * (chance - labels)) + ridge @ at
-        bend = (terms * (weight * chance * (1 - chance) + 1e-9)[:, None]).T @ terms + ridge
-        move = np.linalg.solve(bend, slope)
-        at -= move
-        if np.abs(move).max() < 1e-8:
-            break
+    ridge = np.append(1e-6, np.full(values.shape[1], _RIDGE))
 
-    def answer(others: np.ndarray) -> np.ndarray:
-        unit = np.clip((others - middle) / scale, -6, 6)
-        return 1 / (1 + np.exp(-np.clip(at[0] + unit @ at[1:], -30, 30)))
+    def loss(at: np.ndarray) -> tuple[float, np.ndarray]:
+        score = terms @ at
+        slope = terms.T @ (weight * (expit(score) - labels)) + ridge * at
+        return float(weight @ (np.logaddexp(0, score) - labels * score) + ridge @ at**2 / 2), slope
 
-    return answer
+    at = minimize(loss, np.zeros(terms.shape[1]), jac=True, method="L-BFGS-B", tol=1e-14).x
+    return lambda others: expit(at[0] + np.clip((others - middle) / scale, -6, 6) @ at[1:])
 
 
 @dataclass(frozen=True, kw_only=True)
