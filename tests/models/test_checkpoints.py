@@ -44,6 +44,15 @@ def test_changed_weights_are_refused(run: Path):
         load(run)
 
 
+def test_weights_that_are_no_finite_numbers_are_refused(run: Path, tmp_path: Path):
+    trained = load(run)
+    with torch.no_grad():
+        next(trained.model.parameters()).fill_(float("nan"))
+    save_checkpoint(tmp_path, trained.model, trained.manifest)
+    with pytest.raises(CheckpointError, match="holds a value that is no finite number"):
+        load(tmp_path)
+
+
 def test_a_pickle_in_place_of_weights_is_refused_unopened(run: Path):
     class Bomb:
         def __reduce__(self) -> tuple:

@@ -6,6 +6,7 @@ import pytest
 import torch
 from data_sets import save_dataset
 
+from sliplens.errors import RecordingError
 from sliplens.models.encodings import ENCODINGS
 from sliplens.recordings import Dataset, Recording
 from sliplens.training.data import UNTOUCHED, EpochShuffle, load_frames
@@ -44,6 +45,24 @@ def test_frames_whose_label_cannot_be_trusted_are_left_out(tmp_path: Path, recor
     frames = load_frames(data, data.trials, encoding=ENCODINGS["difference"], image_size=32)
     # frame 0 has no contact, frames 7 to 11 are not trusted
     assert frames.frame == (1, 2, 3, 4, 5, 6)
+
+
+def test_frames_of_two_sizes_are_refused(tmp_path: Path, recording: Recording):
+    wider = replace(recording, trial="wider", frames=recording.frames[:, :, ::2], reference=recording.reference[:, ::2])
+    data = save_dataset(tmp_path, recording, replace(wider, truth=None))
+    with pytest.raises(RecordingError, match=r"mixes frames of .* use one sensor at a time"):
+        load_frames(data, data.trials, encoding=ENCODINGS["difference"], image_size=32)
+
+
+def test_frames_that_do_not_fit_in_memory_are_the_same(
+    tmp_path: Path, small_dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+):
+    options = {"encoding": ENCODINGS["difference"], "image_size": 24}
+    trials = small_dataset.select(split="test")
+    held = load_frames(small_dataset, trials, **options)
+    monkeypatch.setattr("os.sysconf", lambda _: 1)
+    assert torch.equal(load_frames(small_dataset, trials, scratch=tmp_path, **options).images, held.images)
+    assert not list(tmp_path.iterdir())
 
 
 def order(epoch: int, count: int, **options: int) -> list[int]:

@@ -471,6 +471,9 @@ def _load_weights(path: Path, model: nn.Module, *, what: str, sha256: str) -> No
         model.load_state_dict(load_file(path, device="cpu"))  # widens halves, as which the package stores networks
     except (SafetensorError, RuntimeError) as error:
         raise CheckpointError(f"{path} does not hold {what} ({str(error).splitlines()[0]})") from None
+    for name, tensor in model.state_dict().items():
+        if not tensor.isfinite().all():
+            raise CheckpointError(f"{path} holds a value that is no finite number in {name}; train the network again")
 
 
 def read_manifest(run: str | Path) -> Manifest:

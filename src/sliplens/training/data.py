@@ -1,10 +1,13 @@
 """Frames of a training, their augmentation and their order."""
 
 import math
+import os
+import tempfile
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -187,12 +190,16 @@ def load_frames(
     encoding: Encoding,
     image_size: int,
     untouched_share: float = 0.0,
+    scratch: Path | None = None,
 ) -> FrameSet:
     """Load trials, encode them, and keep the frames that have a label; frames without contact have none.
 
+    Frames that would take more than half of the free memory go into a file in the folder `scratch`, deleted with them.
     `untouched_share` adds the untouched sensor, with the label 1 (the limit of light touches), this often for each
     labelled frame and at least once a trial: a network trained on it gives explanations a meaningful reference.
     """
+    if len(sizes := {(info.height, info.width) for info in trials}) > 1:
+        raise RecordingError(f"{data.folder} mixes frames of {sorted(sizes)} pixels; use one sensor at a time")
 
     def copies_of(labelled: int) -> int:
         return max(1, round(untouched_share * labelled)) if untouched_share > 0 else 0
@@ -201,7 +208,14 @@ def load_frames(
     if not sum(counts):
         raise RecordingError(f"{data.folder}: no frame of the {len(trials)} trials has a label; label them first")
     total = sum(count + copies_of(count) for count in counts)
-    images = torch.empty((total, encoding.colours, image_size, image_size), dtype=torch.uint8)
+    shape = total, encoding.colours, image_size, image_size
+    free_bytes = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else math.inf
+    if scratch is None or math.prod(shape) <= free_bytes / 2:
+        images = torch.empty(shape, dtype=torch.uint8)
+    else:
+        with tempfile.TemporaryFile(dir=scratch) as file:
+            file.truncate(math.prod(shape))
+            images = torch.from_numpy(np.memmap(file, dtype=np.uint8, mode="r+", shape=shape))
     labels, ratios, frictions, times, rows = [], [], [], [], []
     for info in report_each(trials):
         recording = data.load(info, truth=False)

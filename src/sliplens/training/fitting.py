@@ -168,7 +168,7 @@ def train(
     def run(folder: Path, opened: Logger | None = None) -> Training:
         if start is not None and config.learns == "sequence":
             return replace(fit_sequence(config, start, data, trials, folder), condition=condition)
-        load_some = partial(load_frames, data, encoding=encoding, image_size=config.image_size)
+        load_some = partial(load_frames, data, encoding=encoding, image_size=config.image_size, scratch=folder)
         with open_stage(f"Reading training trials ({encoding.name})"):
             train_frames = load_some(trials[0], untouched_share=config.untouched_share)
         with open_stage(f"Reading validation trials ({encoding.name})"):
