@@ -128,7 +128,7 @@ def test_where_a_page_links_to_there_is_a_file_with_its_heading(page: Path):
 def command_lines(code: str) -> list[list[str]]:
     """Words of each command of sliplens in a block, without what is said of it."""
     lines = (line.partition("#")[0].split() for line in code.splitlines())
-    return [words[1:] for words in lines if words[:1] == ["sliplens"]]
+    return [words[1:] for words in lines if words[:1] == ["sliplens"] and words[1:] != ["--version"]]
 
 
 @PAGE

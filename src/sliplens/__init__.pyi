@@ -2,7 +2,6 @@
 
 from ._version import __version__ as __version__
 from .demo import run_demo as run_demo
-from .doctor import examine_installation as examine_installation
 from .errors import SliplensError as SliplensError
 from .friction import Friction as Friction
 from .grip.episodes import run_episodes as run_episodes

@@ -64,7 +64,6 @@ def run_demo(
 
     See Also
     --------
-    examine_installation : Test the installation.
     run_study : The study on your own data.
 
     Examples

@@ -9,11 +9,11 @@ from difflib import get_close_matches
 
 import cyclopts
 
-from sliplens._version import __version__
 from sliplens.cli.app import adapt, name_options
 from sliplens.cli.commands import COMMANDS
 from sliplens.cli.console import OUT, fail, say
 from sliplens.errors import InputError, PartError, SliplensError
+from sliplens.files import versions
 
 _DESCRIPTION = (
     "Predict how close a soft robotic fingertip is to losing its grip, from the images of the camera inside it, and "
@@ -99,7 +99,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     try:
         if words[:1] == ["--version"]:
-            say(f"sliplens {__version__}")
+            say(", ".join(f"{name} {version}" for name, version in versions().items()))
         elif not words or words[0] in {"-h", "--help"}:
             _overview()
         else:

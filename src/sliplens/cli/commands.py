@@ -608,11 +608,3 @@ def call_hold(call: Any, source: str, **options: Unpack[HoldOptions]) -> None:
 
 
 command("report", "report.page:write_report", "sliplens report runs/mine")(lambda call: output.print_written(call()))
-
-
-@command("doctor", "doctor:examine_installation", "sliplens doctor")
-def call_doctor(call: Any) -> None:
-    """Print a line for each part; exit code 2 if something that is installed does not work."""
-    with reporting(Terminal()), open_stage("Trying what is installed"):
-        items = call()
-    output.print_items(items)

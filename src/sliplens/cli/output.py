@@ -6,13 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Unpack
 
 from sliplens.cli.console import Terminal, print_file, print_table, say
-from sliplens.errors import InputError
 from sliplens.progress import fold_equal, number_of, open_stage, report_file, reporting
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from sliplens.doctor import Item
     from sliplens.grip.records import Grip
     from sliplens.models.predictions import Predictions
     from sliplens.recordings import Dataset, TrialInfo
@@ -304,14 +302,3 @@ def print_written(written: "Written") -> None:
         count = number_of(len(written.figures) // 2, "figure")
         print_file(written.figures[0].parent, f"{count} as PDF, their numbers as CSV")
     print_file(written.page, "open it in a browser")
-
-
-def print_items(items: "Sequence[Item]") -> None:
-    """Print whether each part of the installation works."""
-    words = {True: "works", False: "fails", None: "not there"}
-    width = max(len(item.name) for item in items)
-    for item in items:
-        say(f"{words[item.works]:9}  {item.name:{width}}  {item.detail}")
-    if failed := [item.name for item in items if item.works is False]:
-        verb = "does" if len(failed) == 1 else "do"
-        raise InputError(f"{', '.join(failed)} {verb} not work; see the lines above")
