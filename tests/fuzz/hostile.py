@@ -14,7 +14,7 @@ import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import chdir
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 from io import BytesIO
 from operator import itemgetter
 from pathlib import Path
@@ -433,10 +433,10 @@ def _bag(folder: Path) -> None:
     write_bag(folder / "bag", sorted([*frames, *samples], key=itemgetter(2)))
 
 
-def _robot(folder: Path, *, images: bool) -> None:
+def _robot(folder: Path) -> None:
     rng = np.random.default_rng(0)
     frames = rng.integers(0, 256, (sum(LENGTHS), HEIGHT, WIDTH, 3), dtype=np.uint8)
-    write_dataset(folder / "robot", frames, rng.normal(size=(len(frames), 6)).astype(np.float32), images=images)
+    write_dataset(folder / "robot", frames, rng.normal(size=(len(frames), 6)).astype(np.float32))
 
 
 def _read_workspace(folder: Path) -> object:
@@ -551,7 +551,6 @@ def _frames_of(name: str, **options: Any) -> Callable[[Path], object]:
     return lambda folder: _read_frames(folder / name, **options)
 
 
-_images = partial(_robot, images=True)
 _ROBOT = ("robot/data/*/*.parquet", "robot/meta/episodes/*/*.parquet")
 _WEIGHTS = {**ANY, "header": _tensors, "not finite": _not_finite}
 FORMATS = {
@@ -577,10 +576,9 @@ FORMATS = {
     "images": Format(_own, ("cup/0*.png",), PICTURE, _frames_of("cup", frame_rate=30.0)),
     "video": Format(_video, ("cup.mkv",), ANY, _frames_of("cup.mkv")),
     "bag": Format(_bag, ("bag/bag.mcap",), ANY, _frames_of("bag/bag.mcap")),
-    "lerobot": Format(_images, ("robot/meta/info.json",), {**ANY, **JSON}, _frames_of("robot")),
-    "lerobot tables": Format(_images, _ROBOT, TABLES, _frames_of("robot")),
+    "lerobot": Format(_robot, ("robot/meta/info.json",), {**ANY, **JSON}, _frames_of("robot")),
+    "lerobot tables": Format(_robot, _ROBOT, TABLES, _frames_of("robot")),
     "toml": Format(_text("tip.toml"), ("*.toml",), TOML, _read_toml),
-    "robot": Format(partial(_robot, images=False), _ROBOT, TABLES, _frames_of("robot")),
 }
 """Every kind of input."""
 

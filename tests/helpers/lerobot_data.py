@@ -10,8 +10,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from own_recording import write_frames
 
-from sliplens.images import encode_png
-
 FPS = 30
 HEIGHT, WIDTH = 48, 64
 LENGTHS = (7, 5, 6)
@@ -54,14 +52,9 @@ def write_table(path: Path, columns: dict[str, Any]) -> None:
     pq.write_table(pa.table(columns), path)
 
 
-def write_dataset(
-    folder: Path, frames: np.ndarray, wrenches: np.ndarray, *, coding: dict[str, Any] = LOSSLESS, images: bool = False
-) -> Path:
+def write_dataset(folder: Path, frames: np.ndarray, wrenches: np.ndarray, *, coding: dict[str, Any] = LOSSLESS) -> Path:
     """Write every episode's frames, rows and metadata as LeRobot lays them out."""
-    if images:
-        write_info(folder, lambda info: info["features"][CAMERA].update(dtype="image"))
-    else:
-        write_info(folder)
+    write_info(folder)
     starts = np.cumsum([0, *LENGTHS])
     episode_of = np.repeat(range(len(LENGTHS)), LENGTHS)
     in_episode = np.arange(sum(LENGTHS)) - starts[episode_of]
@@ -77,11 +70,8 @@ def write_dataset(
             FORCE: pa.FixedSizeListArray.from_arrays(pa.array(wrenches[own].reshape(-1)), 6),
             "observation.state": pa.array(wrenches[own][:, :2].tolist()),
         }
-        if images:
-            columns[CAMERA] = [{"bytes": encode_png(pixels), "path": "frame.png"} for pixels in frames[own]]
-        else:
-            for key, shown in ((CAMERA, frames), (SCENE, 255 - frames)):
-                write_frames(folder / "videos" / key / f"{place}.mp4", shown[own], rate=FPS, **coding)
+        for key, shown in ((CAMERA, frames), (SCENE, 255 - frames)):
+            write_frames(folder / "videos" / key / f"{place}.mp4", shown[own], rate=FPS, **coding)
         write_table(folder / "data" / f"{place}.parquet", columns)
     write_episodes(folder, starts)
     return folder

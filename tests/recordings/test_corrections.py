@@ -7,14 +7,13 @@ import pytest
 from sliplens.errors import InputError
 from sliplens.recordings import Corrections, LabelSettings, read_corrections
 
-_HEADER = "trial,exclude,reference_frame,contact_s,slip_s,tare,normal_sign,mu,bad_frames,current_mu,flags"
+_HEADER = "trial,exclude,reference_frame,contact_s,slip_s,tare,normal_sign,mu,bad_frames,flags"
 
 
 def test_cells_become_corrections_and_empty_ones_none(tmp_path: Path):
     path = tmp_path / "corrections.csv"
     path.write_text(
-        f"\ufeff{_HEADER}\ncup,,3,0.5,1.25,0.1 0 -2e-1,-1,0.7,2..3 9,0.9,a step\n"
-        "jar,yes,,,,,,,,,\negg,no,,,,,,,,0.5,fine\n\n",
+        f"\ufeff{_HEADER}\ncup,,3,0.5,1.25,0.1 0 -2e-1,-1,0.7,2..3 9,a step\njar,yes,,,,,,,,\negg,no,,,,,,,,fine\n\n",
         encoding="utf-8",
     )
     assert read_corrections(path) == {

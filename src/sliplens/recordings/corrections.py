@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
-import numpy as np
-
 from sliplens.errors import InputError, RecordingError
 from sliplens.files import MOST_TEXT, output_folder, remove, require_file, whole_file
 from sliplens.progress import OnProgress, add_note, number_of, reporting
@@ -20,10 +18,8 @@ from sliplens.recordings.labels.margin import require_inside
 from sliplens.recordings.manifest import Column, parse_cells, read_csv
 from sliplens.recordings.options import LabelSettings, TrialSettings
 from sliplens.recordings.store import read_first_reference, read_header
-from sliplens.recordings.trial import ContactState, Recording
 
 _SETTINGS = ("exclude", *(field.name for field in fields(TrialSettings)))
-_CURRENT = ("reference_frame", "contact_s", "slip_s", "tare", "normal_sign", "mu")
 _WORDS = {**dict.fromkeys(("yes", "true", "1", "x"), True), **dict.fromkeys(("no", "false", "0"), False)}
 
 
@@ -48,7 +44,7 @@ _COLUMNS: dict[str, Column] = {
         lambda text: tuple(map(_parse_span, re.split(r"[\s;]+", text))),
         "write spans of frames, such as 10..19 34",
     ),
-    **dict.fromkeys((*(f"current_{name}" for name in _CURRENT), "valid_frames", "frames", "flags"), (str, "")),
+    "flags": (str, ""),
 }
 
 
@@ -56,7 +52,7 @@ def read_corrections(path: Path | str) -> dict[str, Corrections]:
     """Read a table of corrections; gives those of each trial that has any.
 
     The column `trial` names the trial, the others are fields of `Corrections`. An empty cell leaves the automatic
-    value. Columns that `draft_corrections` writes for information are ignored.
+    value; the column `flags` is ignored.
     """
     path = Path(path)
     require_file(path, most=MOST_TEXT, missing="write one with `sliplens label DATA --draft corrections.csv`")
@@ -73,10 +69,9 @@ def read_corrections(path: Path | str) -> dict[str, Corrections]:
 
 
 def draft_corrections(data: Dataset | Path | str, path: Path | str) -> None:
-    """Write a table of corrections to be edited: a row a trial, with its corrections so far and its current labels.
+    """Write a table of corrections to be edited: a row a trial, with its corrections and flags so far.
 
-    Columns that begin with `current_` show the values of the present labels and are ignored on reading: write the value
-    that should hold instead into the column without that prefix. `sliplens label DATA --corrections` applies the table.
+    The audit page of a trial shows its present values. `sliplens label DATA --corrections` applies the table.
 
     See Also
     --------
@@ -95,22 +90,10 @@ def draft_corrections(data: Dataset | Path | str, path: Path | str) -> None:
         writer = csv.DictWriter(stream, _COLUMNS)
         writer.writeheader()
         for info in data.trials:
-            writer.writerow({"trial": info.trial, **_draft_row(data.read_labels(info))})
-
-
-def _draft_row(labels: Recording) -> dict[str, str]:
-    labelling, row = labels.labelling, {"valid_frames": str(labels.labelled.sum()), "frames": str(len(labels))}
-    if labelling is None:
-        return row
-    row |= {name: _cell(getattr(labelling.corrections, name, None)) for name in _SETTINGS}
-    current: dict[str, object] = {"reference_frame": labelling.reference.index}
-    if (basis := labelling.basis) is not None:
-        touching = [state not in (ContactState.NO_CONTACT, ContactState.UNKNOWN) for state in labels.contact_state]
-        time_s = labels.time_s if labels.force_time_s is None else labels.force_time_s
-        current["contact_s"] = float(time_s[np.argmax(touching)]) if any(touching) else None
-        current |= {"slip_s": basis.slip_s, "tare": basis.axes.tare_n, "normal_sign": basis.axes.sign}
-        current["mu"], row["flags"] = basis.friction.mu, "; ".join(basis.flags)
-    return row | {f"current_{name}": _cell(value) for name, value in current.items()}
+            labelling = read_header(trial_path(data.folder, info.trial)).labelling
+            row = {name: _cell(getattr(labelling and labelling.corrections, name, None)) for name in _SETTINGS}
+            flags = labelling.basis.flags if labelling and labelling.basis else ()
+            writer.writerow({"trial": info.trial, **row, "flags": "; ".join(flags)})
 
 
 def _cell(value: object) -> str:

@@ -30,8 +30,6 @@ class ReadOptions:
     """Frames a second, where a video's stamps are missing or wrong."""
     times: Path | None = None
     """Table with the name and the time of every image of a folder (CSV)."""
-    name_unit: str | None = None
-    """Unit (s, ms, us, ns) of the last number in the names of images, which is then their time."""
     skip_frames: int | None = None
     """Number of frames to leave out at the start of a video."""
     start_s: float | None = None

@@ -235,8 +235,7 @@ def _read_captures(
             captures = open_captures(source, format=format, options=options)
             # unlike on import, the times of images may stay unknown
             if whole and any(capture.time_s is None for capture in captures):
-                cure = "give one of --times, --frame-rate, --name-unit"
-                raise RecordingError(f"the frames of {source} have no times; {cure}")
+                raise RecordingError(f"the frames of {source} have no times; give --times or --frame-rate")
             return captures
         name, where, what = trial_name(source.stem), str(source), f"frames of {source}"
         files = None if is_array else (source.name,)

@@ -68,7 +68,7 @@ _ROWS = {
     "images": Reader(
         words="folder of images, with a table of forces",
         recognises=lambda path: path.is_dir() and any(file.suffix.lower() in IMAGE_SUFFIXES for file in path.iterdir()),
-        takes=(*_FORCE_TABLE, "times", "name_unit"),
+        takes=(*_FORCE_TABLE, "times"),
         read=read_image_folder,
     ),
     "video": Reader(

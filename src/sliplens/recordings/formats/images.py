@@ -1,7 +1,6 @@
 """Images in files: a folder as one trial, and stills under known forces, listed in a table, a row an image."""
 
 import os
-import re
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -73,10 +72,9 @@ def read_frame_times(
 
 def read_image_folder(folder: Path, options: ReadOptions) -> Capture:
     """Open a folder of images, in natural order (2 before 10), and a table of forces recorded beside it."""
-    times, frame_rate, name_unit = options.times, options.frame_rate, options.name_unit
-    if sum(option is not None for option in (times, frame_rate, name_unit)) > 1:
-        cure = "give one of --times, --frame-rate, --name-unit"
-        raise RecordingError(f"the images of {folder} have more than one source of times; {cure}")
+    times, frame_rate = options.times, options.frame_rate
+    if times is not None and frame_rate is not None:
+        raise RecordingError(f"the images of {folder} have two sources of times; give --times or --frame-rate")
     paths = tuple(list_images(folder))
     notes, time = [], np.full(len(paths), np.nan)
     if times is not None:
@@ -84,16 +82,8 @@ def read_image_folder(folder: Path, options: ReadOptions) -> Capture:
     elif frame_rate is not None:
         time = tables.evenly_spaced(len(paths), frame_rate=frame_rate)
         notes.append(f"{folder.name}: frames were declared to be taken {frame_rate:g} times a second.")
-    elif name_unit is not None:
-        unit = tables.require_unit(name_unit, quantity="time")
-        numbers = [re.findall(r"\d+(?:\.\d+)?", path.stem) for path in paths]
-        if [] in numbers:
-            path = paths[numbers.index([])]
-            raise RecordingError(f"{path} has no number in its name; give its time in a table (--times) instead")
-        time = np.array([float(each[-1]) for each in numbers]) * tables.UNITS["time"][unit][0]
-        notes.append(f"{folder.name}: the last number in a file's name was declared to be its time in {unit}.")
     elif options.forces is not None:
-        raise RecordingError(f"the images of {folder} have no times; give one of --times, --frame-rate, --name-unit")
+        raise RecordingError(f"the images of {folder} have no times; give --times or --frame-rate")
     lossy = sum(path.suffix.lower() in {".jpg", ".jpeg"} for path in paths)
     if lossy:
         jpeg = f"{lossy} of {len(paths)} frames are JPEG, which moves markers; record PNG or TIFF where you can."
