@@ -11,7 +11,6 @@ from sliplens.grip.controllers import MarginLaw
 from sliplens.grip.source import GripSource, GripStatus, open_grip, usual_network
 from sliplens.live.contract import LiveOptions, Pace
 from sliplens.live.reading import Reading, SlipState
-from sliplens.recordings.sensor import SensorProfile
 
 RATE_HZ = 30.0
 
@@ -101,16 +100,11 @@ def test_a_gripper_is_named_with_what_it_holds():
 
 
 @pytest.mark.parametrize(
-    ("source", "profile", "network"),
+    ("source", "network"),
     [
-        ("simulated", None, DEFAULT_NETWORK),
-        (GripSource(), None, DEFAULT_NETWORK),
-        ("simulated:flat-gel", None, None),
-        ("0", None, None),
-        ("0", SensorProfile(name="tip", network="own"), "own"),
-        ("simulated", SensorProfile(name="tip", network="own"), "own"),
-        ("simulated", SensorProfile(name="tip"), None),
+        *((name, DEFAULT_NETWORK) for name in ("simulated", "simulated:chromatouch", "grip", "grip:egg")),
+        *((name, None) for name in ("simulated:flat-gel", "0", "gripper.mp4")),
     ],
 )
-def test_where_no_network_is_named_the_profile_goes_before_what_is_simulated(source, profile, network):
-    assert usual_network(source, profile) == network
+def test_simulated_sensors_of_the_training_have_a_network(source: str, network: str | None):
+    assert usual_network(source) == network

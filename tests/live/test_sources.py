@@ -112,3 +112,10 @@ def test_frames_and_reference_go_through_the_profile():
     assert images
     for number, image in images.items():
         np.testing.assert_array_equal(image, tip.apply(frames[number]))
+
+
+@pytest.mark.parametrize("named", [None, "chromatouch-difference"])
+def test_the_network_of_the_profile_is_used_where_no_other_is_named(named: str | None):
+    reader = sl.LiveReader("simulated", named, sensor=SensorProfile(name="tip", network="chromatouch-pair"))
+    assert reader.network is not None
+    assert reader.network.manifest.input == ("pair" if named is None else "difference")

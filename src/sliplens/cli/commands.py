@@ -149,10 +149,11 @@ def call_live(
     arguments = {"source": "simulated", "network": None, "options": LiveOptions(), "sensor": None} | call.keywords
     sensor = arguments["sensor"] or ""
     profile = arguments["sensor"] = load_profile(sensor) if is_profile(sensor) else None
+    if profile is None:
+        arguments["network"] = arguments["network"] or usual_network(arguments["source"])
     if (grip := open_grip(arguments["source"], arguments["options"])) is not None:
         arguments |= {"source": grip, "options": None}
     facts = TrialFacts(trial="live", sensor=sensor, object=object, condition=condition, day=day)
-    arguments["network"] = arguments["network"] or usual_network(arguments["source"], profile)
     with ExitStack() as stack:
         reader = stack.enter_context(closing(LiveReader(**arguments)))
         reader.send_to(*sink)
@@ -563,31 +564,24 @@ def call_hold(call: Any, source: str, **options: Unpack[HoldOptions]) -> None:
     from sliplens.live import LiveReader
     from sliplens.live.contract import LiveOptions
     from sliplens.live.frame_reader import ReaderSettings
-    from sliplens.models import load
-    from sliplens.recordings.sensor import load_profile
 
     arguments = call.keywords
     gripper = arguments["gripper"]
     make_controller(arguments.get("controller", "margin"), arguments.get("settings"))  # refused before a network loads
     names = [name for name in (source, options.get("second")) if name is not None]
-    reference, sensor = options.get("reference", ()), options.get("sensor")
+    reference = options.get("reference", ())
     if reference and len(reference) != len(names):
         raise InputError(f"--reference takes an image for each source, {len(names)}, got {len(reference)}")
-    profile = None if sensor is None else load_profile(sensor)
-    sources = [open_grip(source, LiveOptions()) or source for source in names]
-    networks = [options.get("network") or usual_network(source, profile) for source in sources]
-    device, messages = options.get("device", "cpu"), options.get("messages", "gripper-command")
-    loaded = {name: load(name, device=device) for name in dict.fromkeys(networks) if name is not None}
+    settings = {name: options[name] for name in options.keys() & ReaderSettings.__annotations__.keys() - {"reference"}}
     with ExitStack() as stack:
         if gripper not in {"simulated", "dry-run"}:
+            messages = options.get("messages", "gripper-command")
             gripper = stack.enter_context(closing(open_gripper(gripper, messages=messages, joint=options.get("joint"))))
-        settings = {name: options[name] for name in options.keys() & ReaderSettings.__annotations__.keys() - {"device"}}
-        readers = [
-            stack.enter_context(
-                LiveReader(source, loaded.get(network or ""), **settings | {"reference": image, "sensor": profile})
-            )
-            for source, network, image in zip(sources, networks, reference or [None] * len(sources), strict=True)
-        ]
+        readers = list["LiveReader"]()
+        for name, image in zip(names, reference or [None] * len(names), strict=True):
+            network = options.get("network") or (usual_network(name) if "sensor" not in settings else None)
+            finger = open_grip(name, LiveOptions()) or name
+            readers.append(stack.enter_context(LiveReader(finger, network, reference=image, **settings)))
         log = _Log()
 
         def on_step(step: "HoldStep") -> None:

@@ -8,6 +8,7 @@ from typing import Annotated, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
+from scipy.sparse import csr_array
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
@@ -117,8 +118,8 @@ class MarkerField:
     def __init__(self, seeds: Sequence[int]) -> None:
         rest, press, shear = (np.stack(values) for values in zip(*map(_marker_grid, seeds), strict=True))
         self.rest_px = rest
-        # the fingers of all grippers in a row
-        self._press_px, self._shear_px = (values.reshape(-1, *values.shape[2:]) for values in (press, shear))
+        # a row a state: motion by the press at each force, below it motion by the pull
+        self._moved_px = np.concatenate([press.reshape(-1, _MARKERS * 2), shear.reshape(-1, _MARKERS * 2)])
 
     def at(
         self,
@@ -135,15 +136,17 @@ class MarkerField:
         force, part = (values[:, None] for values in place_in_grid(np.asarray(_FORCES_N), normal_force_n))
         margin, share = place_in_grid(np.asarray(_MARGINS), margins)
         pull = np.where(pulled_back, -1, 1) * friction
-        moved = np.zeros((*tips.shape, _MARKERS, 2))
+        first, states = 2 * len(self.rest_px) * len(_FORCES_N), list[tuple[np.ndarray, np.ndarray]]()
         for upper, by_force in ((0, 1 - part), (1, part)):
-            weight = touches * by_force
-            states = [(self._press_px[tips, force + upper], np.broadcast_to(weight, tips.shape))]
+            press, weight = tips * len(_FORCES_N) + force + upper, np.broadcast_to(touches * by_force, tips.shape)
+            states.append((press, weight))
             for right, by_margin in ((0, 1 - share), (1, share)):
-                states.append((self._shear_px[tips, force + upper, margin + right], weight * by_margin * pull))
-            for state_px, by_state in states:
-                moved += np.multiply(state_px, by_state[..., None, None], out=state_px)
-        return self.rest_px[grippers] + moved
+                states.append((first + press * len(_MARGINS) + margin + right, weight * by_margin * pull))
+        # a sparse product sums the weighted states without a temporary array each
+        rows, weights = (np.stack(parts, axis=-1) for parts in zip(*states, strict=True))
+        starts = np.arange(0, rows.size + 1, len(states))
+        mix = csr_array((weights.ravel(), rows.ravel(), starts), shape=(tips.size, len(self._moved_px)))
+        return self.rest_px[grippers] + (mix @ self._moved_px).reshape(*tips.shape, _MARKERS, 2)
 
 
 _FORCES_N = (_TOUCH_N, 0.1, 0.3, 0.6, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)

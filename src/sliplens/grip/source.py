@@ -3,7 +3,6 @@
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from threading import Lock
 
 import numpy as np
@@ -11,7 +10,6 @@ import numpy as np
 from sliplens.errors import InputError
 from sliplens.extras import pick
 from sliplens.files import DEFAULT_NETWORK
-from sliplens.friction import require_friction
 from sliplens.grip.controllers import Holder
 from sliplens.grip.fingertip import Fingertip
 from sliplens.grip.gripper import GripperState
@@ -19,7 +17,6 @@ from sliplens.grip.plant import LIFT_S, LIFTED_S, OBJECTS, PERIOD_S, Plant, Worl
 from sliplens.live.contract import LiveOptions, LiveSource, Pace
 from sliplens.live.reading import LiveFrame, Reading
 from sliplens.recordings.capture import Forces
-from sliplens.recordings.sensor import SensorProfile
 
 OPEN_S = 1.5
 """Time for which the fingers stay open at first, to show the untouched sensor, and after a drop."""
@@ -28,7 +25,7 @@ _CEILING_N = 2.8
 a grip that is never loosened blindly would stay there."""
 _MEMORY = 120
 _POURS_KG_S, _PULLS_N_S = 0.03, 2.0  # rates at which a person pours and pulls
-_FAINTEST_N = 0.02
+_FRICTION, _FAINTEST_N = 0.7, 0.02
 _WIDTHS_M = (0.09, 0.07)  # opening of the fingers without and with an object between them (assumed)
 
 
@@ -68,17 +65,8 @@ class GripSource(LiveSource):
 
     simulated = True
 
-    def __init__(
-        self,
-        object: str = "cup",
-        controller: str = "margin",
-        *,
-        friction: float = 0.7,
-        rate_hz: float = 30.0,
-        seed: int = 0,
-    ) -> None:
-        require_friction(friction)
-        self._object, self._friction, self._tip = pick(OBJECTS, object, noun="object"), friction, Fingertip(seed=seed)
+    def __init__(self, object: str = "cup", controller: str = "margin", *, rate_hz: float = 30.0) -> None:
+        self._object, self._tip = pick(OBJECTS, object, noun="object"), Fingertip(seed=0)
         self.name, self.rate_hz, self.reference = f"a simulated gripper ({object})", rate_hz, self._tip.reference
         self.size = self.reference.shape[0], self.reference.shape[1]
         self._lock = Lock()
@@ -189,7 +177,7 @@ class GripSource(LiveSource):
     def _world(self) -> World:
         return World(
             mass_kg=np.array([self._object.mass_kg[0] + self._poured_kg]),
-            friction=np.full((1, 2), self._friction * (0.5 if self.wet else 1.0)),
+            friction=np.full((1, 2), _FRICTION * (0.5 if self.wet else 1.0)),
             kinetic_ratio=np.array([0.8]),
             pull_n=np.array([self._pulled_n]),
         )
@@ -223,9 +211,7 @@ def open_grip(name: str, options: LiveOptions) -> GripSource | None:
     return GripSource(gripped or "cup", rate_hz=options.rate_hz or 30.0)
 
 
-def usual_network(source: LiveSource | Path | str, profile: SensorProfile | None) -> str | None:
-    """Return the default network of a source: the profile's, else the package's for the sensor it was trained on."""
-    if profile is not None:
-        return profile.network
-    simulated = isinstance(source, GripSource) or source in {"simulated", "simulated:chromatouch"}
+def usual_network(name: str) -> str | None:
+    """Return the network of the package for a simulated source of the sensor it was trained on; None for others."""
+    simulated = name.partition(":")[0] == "grip" or name in {"simulated", "simulated:chromatouch"}
     return DEFAULT_NETWORK if simulated else None

@@ -15,7 +15,7 @@ from sliplens.friction import FrictionLike, SlipLearner, as_friction
 from sliplens.images import require_rgb, soften
 from sliplens.live.contract import LiveOptions, LiveSource
 from sliplens.live.health import HealthMonitor, check_direction, check_novelty, margin_risk
-from sliplens.live.reading import OFF, Latency, LiveFrame, Reading, small_factor, small_picture
+from sliplens.live.reading import OFF, Check, Latency, LiveFrame, Reading, small_factor, small_picture
 from sliplens.live.slip import SlipDetector
 from sliplens.markers import Tracker
 from sliplens.models.checkpoint import Network
@@ -198,17 +198,17 @@ class FrameReader:
             latency=Latency(decode_ms=frame.decode_ms),
         )
         why = self._unready(last, frame)
-        self._last = self._read(begin, frame, early) if why is None else _withhold(begin, why)
+        self._last = _timed(self._read(begin, frame, early) if why is None else replace(begin, withheld=why))
         return self._last
 
     def _read(self, begin: Reading, frame: LiveFrame, early: Callable[[Reading], None] | None) -> Reading:
         """Read a frame that can be compared with the reference."""
         last, network = self._last, self.network
         if network is None or self.engine is None or self.reference is None:
-            return _withhold(*self._check(begin, frame))
+            return self._check(begin, frame)
         # the head for several frames predicts each once, after all checks
         is_early = early is not None and last is not None and last.margin is not None and self._follower is None
-        checked, begun = [], time.perf_counter()
+        checked, begun = list[Reading](), time.perf_counter()
         inputs = network.encode(frame.image[None], self.reference)
         encoded = time.perf_counter()
 
@@ -217,16 +217,15 @@ class FrameReader:
             checked.append(self._check_now(begin, frame) if is_early else self._check(begin, frame))
 
         [parts] = self.engine.answers(batches())
-        [(reading, withheld)] = checked
+        [reading] = checked
         network_ms = 1e3 * (time.perf_counter() - encoded) - reading.latency.checks_ms
         latency = replace(reading.latency, encode_ms=1e3 * (encoded - begun), network_ms=network_ms)
-        reading = replace(reading, latency=latency)
+        reading = self._estimate(replace(reading, latency=latency), frame, network, parts)
         if is_early:
-            first = _withhold(reading, withheld) if withheld else self._estimate(reading, frame, network, parts)
-            if early is not None and first.margin is not None and first.health[-1].name == "novelty":
-                early(first)
-            reading, withheld = self._check(replace(begin, latency=latency), frame)
-        return _withhold(reading, withheld) if withheld else self._estimate(reading, frame, network, parts)
+            if early is not None and reading.margin is not None and reading.health[-1].name == "novelty":
+                early(_timed(reading))
+            reading = self._estimate(self._check(replace(begin, latency=latency), frame), frame, network, parts)
+        return reading
 
     def _unready(self, last: Reading | None, frame: LiveFrame) -> str | None:
         """Explain why a frame cannot be compared with a reference, after taking a new one where that is due."""
@@ -247,7 +246,7 @@ class FrameReader:
             return "there is no reference frame yet; the picture must be still for a moment: leave the sensor untouched"
         return None
 
-    def _check_now(self, begin: Reading, frame: LiveFrame) -> tuple[Reading, str | None]:
+    def _check_now(self, begin: Reading, frame: LiveFrame) -> Reading:
         """Make the cheap checks of a frame; all else in its reading is of the frame before."""
         begun, last = time.perf_counter(), self._last
         health = () if self._health is None else self._health.check_now(frame)
@@ -256,11 +255,10 @@ class FrameReader:
             health += tuple(replace(check, age_s=age_s) for check in last.health if check.name == "direction")
             begin = replace(begin, slip=last.slip, markers=last.markers)
         latency = replace(begin.latency, checks_ms=1e3 * (time.perf_counter() - begun))
-        withheld = next((check.sentence for check in health if not check.ok), None)
-        return replace(begin, health=health, complete=False, latency=latency), withheld
+        return replace(begin, health=health, withheld=_first_fault(health), complete=False, latency=latency)
 
-    def _check(self, begin: Reading, frame: LiveFrame) -> tuple[Reading, str | None]:
-        """Track the markers of a frame and check its health; returns its reading, and why it has no margin."""
+    def _check(self, begin: Reading, frame: LiveFrame) -> Reading:
+        """Track the markers of a frame and check its health; returns its reading without the margin."""
         begun = time.perf_counter()
         tracked = markers = None
         if self._tracker is not None and self._slip is not None:
@@ -273,20 +271,23 @@ class FrameReader:
             health = (*health, check_direction(self.network, self._shear.estimate(frame.image)))
         checks_ms = begin.latency.checks_ms + 1e3 * (time.perf_counter() - begun)
         latency = replace(begin.latency, checks_ms=checks_ms)
-        withheld = next((check.sentence for check in health if not check.ok), None)
-        reading = replace(begin, slip=markers and markers.state, markers=markers, health=health, latency=latency)
+        withheld, slip = _first_fault(health), markers and markers.state
+        reading = replace(begin, slip=slip, markers=markers, health=health, withheld=withheld, latency=latency)
         untouched = any(check.name == "touch" and not check.ok for check in health)
-        if untouched or (markers is not None and markers.contact is False):
-            reading = replace(reading, contact_state=ContactState.NO_CONTACT)
+        touches = not untouched and (markers is None or markers.contact is not False)
+        if not touches:
             withheld = withheld or (None if self.network is None else _NO_CONTACT)
-        if self._follower is not None and reading.contact_state == ContactState.NO_CONTACT:
-            self._follower.forget()
+            reading = replace(reading, contact_state=ContactState.NO_CONTACT, withheld=withheld)
+            if self._follower is not None:
+                self._follower.forget()
         slipping_s = None if markers is None else markers.slipped_s  # of a pull that was let go it is None
-        touches = reading.contact_state != ContactState.NO_CONTACT
         self.learner.update(frame.time_s, slipping_s=slipping_s, touches=touches)
-        return reading, withheld
+        return reading
 
     def _estimate(self, reading: Reading, frame: LiveFrame, network: Network, parts: tuple[Tensor, ...]) -> Reading:
+        """Add the margin to a checked reading, unless it is withheld."""
+        if reading.withheld is not None:
+            return reading
         friction = self.learner.friction
         follower = self._follower if friction is None else None  # it takes no friction
         estimate = network.to_estimate(*parts, friction=friction)
@@ -294,7 +295,7 @@ class FrameReader:
         if novelty is not None:
             reading = replace(reading, health=(*reading.health, novelty))
             if not novelty.ok:
-                return _withhold(reading, novelty.sentence)
+                return replace(reading, withheld=novelty.sentence)
         if follower is not None:
             estimate = follower.update(estimate, np.array([frame.time_s]), np.array([True]))
         ratio = None if estimate.ratio is None else float(estimate.ratio.mean[0])
@@ -316,7 +317,6 @@ class FrameReader:
             sequence=follower is not None and not follower.lost,
             risk=margin_risk(reading.health, float(estimate.beyond(OFF)[0])) if reading.health else None,
             contact_state=state,
-            latency=replace(reading.latency, total_ms=_since_ms(frame.captured_s)),
         )
 
     def _set_reference(self, image: Frame) -> None:
@@ -354,10 +354,10 @@ def _in_pixels(size: tuple[int, ...]) -> str:
     return f"{size[0]} x {size[1]}"
 
 
-def _withhold(reading: Reading, why: str | None) -> Reading:
-    latency = replace(reading.latency, total_ms=_since_ms(reading.captured_s))
-    return replace(reading, withheld=why, latency=latency)
+def _first_fault(health: tuple[Check, ...]) -> str | None:
+    return next((check.sentence for check in health if not check.ok), None)
 
 
-def _since_ms(captured_s: float) -> float:
-    return 1e3 * (time.monotonic() - captured_s)
+def _timed(reading: Reading) -> Reading:
+    total_ms = 1e3 * (time.monotonic() - reading.captured_s)
+    return replace(reading, latency=replace(reading.latency, total_ms=total_ms))

@@ -357,8 +357,15 @@ class LiveReader(FrameReader):
 
     def _capture(self) -> None:
         """Capture until the source ends; one that is lost is opened again until it is back."""
-        while not self._stopped.is_set():
+        lost = False
+        while not (self._stopped.wait(_RETRY_S) if lost else self._stopped.is_set()):
             try:
+                if lost:
+                    self.source.__exit__(None, None, None)
+                    self.source.__enter__()
+                    if self._stopped.is_set():  # `close` has left it already
+                        self.source.__exit__(None, None, None)
+                        return
                 for frame in self.source.frames():
                     if self._stopped.is_set():
                         return
@@ -367,8 +374,7 @@ class LiveReader(FrameReader):
             except SourceError as error:
                 if not self.source.reconnects:
                     raise
-                self._trouble = str(error)
-                self._reconnect()
+                lost, self._trouble = True, str(error)
             else:
                 return
 
@@ -383,18 +389,6 @@ class LiveReader(FrameReader):
         if (recorder := self.recorder) is not None and (reference := self.reference) is not None:
             recorder.add(frame, reference)
         self._frames.put(frame)
-
-    def _reconnect(self) -> None:
-        while not self._stopped.wait(_RETRY_S):
-            self.source.__exit__(None, None, None)
-            try:
-                self.source.__enter__()
-            except SourceError as error:
-                self._trouble = str(error)
-                continue
-            if self._stopped.is_set():  # `close` has left it already
-                self.source.__exit__(None, None, None)
-            return
 
     def _infer(self) -> None:
         ends_s = np.inf if self._seconds is None else time.monotonic() + self._seconds

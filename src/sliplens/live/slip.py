@@ -203,9 +203,7 @@ class SlipBatch:
         if time_s - self._still[0][0] < _STILL_S or len(self._still) < _STILL_FRAMES:
             return
         steps = np.diff(np.stack([field for _, field in self._still], axis=1), axis=1)
-        valid = np.isfinite(steps)
-        count = valid.sum(axis=3)
-        mean = np.where(count, np.where(valid, steps, 0).sum(axis=3) / np.maximum(count, 1), np.nan)
+        mean = np.ma.masked_invalid(steps).mean(axis=3).filled(np.nan)
         mean *= np.sqrt(np.isfinite(moved[:, 0]).sum(axis=1))[:, None, None]
         # of differences, and their median: creep and a touch that begins count little
         single, together = (
@@ -292,9 +290,8 @@ class SlipBatch:
         for frame, counts in zip(frames, inside, strict=True):
             valid &= frame.visible[rows] | ~counts[:, None]
         rest, pattern, hold = (np.where(valid[:, None], values, 0) for values in (rest, pattern, hold))
-        arm = (rest - rest.sum(axis=2, keepdims=True) / np.maximum(valid.sum(axis=1), 1)[:, None, None]) * valid[
-            :, None
-        ]
+        middle = rest.sum(axis=2, keepdims=True) / np.maximum(valid.sum(axis=1), 1)[:, None, None]
+        arm = (rest - middle) * valid[:, None]
         # a grip that is tightened or loosened moves the markers as its press did, or from the middle
         press = _unit(hold)
         pattern = _without(pattern, press, _unit(_without(arm, press)))
@@ -399,11 +396,8 @@ class SlipDetector:
     """
 
     def __init__(self, rest_px: Field) -> None:
-        self._batch, self._rest_px, self._before = (
-            SlipBatch(rest_px[None]),
-            rest_px,
-            np.full((2, *rest_px.shape), np.nan),
-        )
+        self._batch, self._rest_px = SlipBatch(rest_px[None]), rest_px
+        self._before = np.full((2, *rest_px.shape), np.nan)
         self._noises_px: deque[float] = deque(maxlen=_NOISE_FRAMES)
         self._largest_px, self._press_seen = 0.0, False
 
@@ -460,9 +454,7 @@ def _from_middle(places_px: Fields) -> Fields:
 
 def _affine_weights(rest_px: Fields, visible: Bool[np.ndarray, "rows markers"]) -> Fields:
     """Compute the weights of each marker in the mean and the divergence (x and y) of its field, as `affine_parts`."""
-    terms = (
-        np.concatenate([np.ones((len(visible), 1, visible.shape[1])), _from_middle(rest_px)], axis=1) * visible[:, None]
-    )
+    terms = np.insert(_from_middle(rest_px), 0, 1.0, axis=1) * visible[:, None]
     return np.linalg.solve(terms @ terms.swapaxes(1, 2) + 1e-9 * np.eye(3), terms)
 
 
