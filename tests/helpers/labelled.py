@@ -2,7 +2,6 @@
 
 from sliplens.recordings.labelling import (
     ForceAxes,
-    Found,
     FrictionEstimate,
     LabelBasis,
     Labelling,
@@ -14,7 +13,7 @@ LABELLING = Labelling(
     source="Prüfstand ‰",
     forces=None,
     notes=("Grüße\u2028",),
-    reference=ReferenceChoice(index=4, method="named", contact_energy=0.1 + 0.2),
+    reference=ReferenceChoice(index=4, method="named"),
     basis=LabelBasis(
         axes=ForceAxes(
             normal="z",
@@ -23,16 +22,11 @@ LABELLING = Labelling(
             noise_n=(0.1, 0.2, 0.3),
             tare_sigma_n=(1 / 3, 0.0, 0.0),
             still_until_s=None,
-            normal_found=Found.INFERRED,
-            sign_found=Found.DECLARED,
-            tare_found=Found.ASSUMED,
         ),
         friction=FrictionEstimate(mu=0.3, low=0.2, high=0.4),
         slip_s=None,
         lag=Lag(lag_s=0.1, sigma_s=1 / 3),
         lag_applied=False,
         contact_threshold_n=0.1,
-        window_s=0.04,
-        gap_s=0.01,
     ),
 )

@@ -46,9 +46,6 @@ AXES = ForceAxes(
     noise_n=(0.021, 0.022, 0.023),
     tare_sigma_n=(0.001, 0.002, 0.003),
     still_until_s=0.12,
-    normal_found=Found.INFERRED,
-    sign_found=Found.DECLARED,
-    tare_found=Found.INFERRED,
 )
 FRICTION = FrictionEstimate(
     mu=MU,
@@ -57,10 +54,9 @@ FRICTION = FrictionEstimate(
     onset_s=1.97,
     found=Found.INFERRED,
     method="break of F_t / F_n, seen in the image",
-    image_sigmas=12.3,
 )
 LAG = Lag(lag_s=0.015, sigma_s=0.009, correlation=0.87)
-REFERENCE = ReferenceChoice(index=2, method="least contact energy", contact_energy=0.42)
+REFERENCE = ReferenceChoice(index=2, method="least contact energy")
 
 
 def make_labelling(
@@ -74,8 +70,6 @@ def make_labelling(
         lag=LAG,
         lag_applied=False,
         contact_threshold_n=0.061,
-        window_s=0.04,
-        gap_s=0.008,
     )
     return Labelling(
         source=source,
@@ -232,9 +226,7 @@ def test_no_words_lie_over_others_or_leave_the_page(size):
         friction=replace(
             FRICTION, low=MU, high=MU, found=Found.DECLARED, method="given by hand, after three trials by eye"
         ),
-        axes=replace(
-            AXES, tare_n=(-1234.5, 2345.6, -3456.7), tare_found=Found.ASSUMED, notes=("the normal axis is doubtful",)
-        ),
+        axes=replace(AXES, tare_n=(-1234.5, 2345.6, -3456.7), notes=("the normal axis is doubtful",)),
     )
 
     outside, pairs = misplaced(draw_audit(trial, told))

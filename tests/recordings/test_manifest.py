@@ -38,8 +38,8 @@ def test_recordings_that_end_like_tables_and_names_of_any_script_find_theirs(tmp
 @pytest.mark.parametrize(
     ("names", "words"),
     [
-        (("cup.mp4", "cup.avi"), "recordings named cup"),
-        (("cup.mp4", "cup.csv", "cup_ft.csv"), "tables of forces named cup"),
+        (("cup.mp4", "cup.avi"), "trials named cup"),
+        (("cup.mp4", "cup.csv", "cup_ft.csv"), "several tables of forces"),
         (("a b.mp4", "a-b.avi"), "trials named a-b"),
         (("notes.txt",), "no recording"),
     ],

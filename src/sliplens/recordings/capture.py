@@ -62,12 +62,8 @@ class Capture(TrialFacts):
             raise RecordingError(f"{self.source} has no frame; leave it out or record it again")
         if self.time_s is not None:
             require_rising(self.frame_time_s, what=f"the frames of {self.source}")
-        if self.labels is not None and len(self.labels.safety_margin) != len(self.frame_time_s):
-            raise RecordingError(f"{self.source} has labels for other frames than its {len(self)}; give as many")
         if self.reference is not None:
             require_rgb(self.reference, what="levels of the reference")
-        if self.reference is not None and self.reference.shape[:2] != self.frame_size:
-            raise RecordingError(f"{self.source} has a reference of another size than its frames; record both alike")
 
     def __len__(self) -> int:
         return len(self.frame_time_s)

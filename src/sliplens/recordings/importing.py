@@ -148,7 +148,6 @@ def import_trial(job: TrialJob, path: Path) -> None:
             else:
                 of_forces = np.zeros(len(capture), dtype=np.bool_) if untouched is None else untouched
                 choice = choose_reference(footage.read, of_forces, index=index)
-                choice = choice if untouched is not None else replace(choice, contact_energy=None)
                 (reference,) = footage.read([choice.index or 0])
         except RecordingError as error:
             raise RecordingError(f"{capture.source}: {error}{job.cure}") from None

@@ -21,7 +21,6 @@ class Found(StrEnum):
 
     DECLARED = "declared"
     INFERRED = "inferred"
-    ASSUMED = "assumed"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,9 +33,6 @@ class ForceAxes:
     noise_n: Vector  #: Standard deviation of a sample's noise.
     tare_sigma_n: Vector  #: Standard uncertainty of the tare.
     still_until_s: float | None  #: Time until which the sensor is certainly untouched; None where it is never touched.
-    normal_found: Found
-    sign_found: Found
-    tare_found: Found
     drift_n_s: Vector = (0.0, 0.0, 0.0)
     """Rate at which the reading of the untouched sensor drifts; 0 where it is not significant."""
     drift_sigma_n_s: Vector = (0.0, 0.0, 0.0)  #: Standard uncertainty of that rate.
@@ -75,8 +71,6 @@ class FrictionEstimate:
     onset_s: float | None = None  #: First gross slip, on the force sensor's clock; None where no slip is known.
     found: Found = Found.DECLARED
     method: str = "given by hand"  #: Method of the estimate, in words.
-    image_sigmas: float | None = None
-    """Motion of the image at the onset beyond that before it, in standard deviations; None where not measured."""
     later_onsets_s: tuple[float, ...] = ()  #: Gross slips of later contacts, at most one each.
     notes: tuple[str, ...] = ()
     """Contradictions with the forces, a sentence each; they count as errors of the friction."""
@@ -84,8 +78,6 @@ class FrictionEstimate:
     def __post_init__(self) -> None:
         if not 0 < self.mu <= MOST_FRICTION:
             raise RecordingError(f"the coefficient of friction is {self.mu:.3g}; give 0 to {MOST_FRICTION:g}")
-        if not 0 <= self.low <= self.mu <= self.high < np.inf:
-            raise RecordingError(f"friction {self.mu:.3g} lies outside its interval; give low, mu, high in their order")
 
     @property
     def sigma(self) -> float:
@@ -115,8 +107,6 @@ class ReferenceChoice:
 
     index: int | None = None  #: Number of the frame; None where the reference was recorded apart from the frames.
     method: str
-    contact_energy: float | None = None
-    """Mean absolute high-pass difference from the median untouched frame, in grey levels; None where not measured."""
 
 
 class Reason(StrEnum):
@@ -157,8 +147,6 @@ class LabelBasis:
     lag: Lag | None  #: None where it was neither estimated nor set.
     lag_applied: bool
     contact_threshold_n: float
-    window_s: float  #: Time over which the forces of a frame were averaged.
-    gap_s: float  #: Time beyond which samples count as missing between two others.
     faults: tuple[ForceFault, ...] = ()  #: Samples that were left out, in the order of time.
     doubts: tuple[str, ...] = ()  #: Other implausible findings, a sentence each.
 

@@ -55,31 +55,28 @@ def pair_recordings(folder: Path) -> tuple[ManifestRow, ...]:
     sliplens, which may have been made of this very folder.
     """
     tables: dict[str, list[Path]] = {}
-    recordings: dict[str, list[Path]] = {}
+    recordings: dict[Path, str] = {}
     for path in (paths := [path for path in sorted(folder.iterdir()) if not path.name.startswith(".")]):
         bag = path.is_dir() or path.suffix in {".mcap", ".db3"}
         if path.suffix.lower() in _VIDEOS or (bag and recognise(path) not in {None, "sliplens"}):
             # some systems write an umlaut as two characters
-            name = unicodedata.normalize("NFC", path.stem if path.is_file() else path.name)
-            recordings.setdefault(name, []).append(path)
+            recordings[path] = unicodedata.normalize("NFC", path.stem if path.is_file() else path.name)
     for path in paths:
         if path.is_file() and path.suffix.lower() in _TABLES:
             stem = unicodedata.normalize("NFC", path.stem)
             # a recording may itself be named lift_ft
-            tables.setdefault(stem if stem in recordings else _FORCE_SUFFIX.sub("", stem), []).append(path)
+            tables.setdefault(stem if stem in recordings.values() else _FORCE_SUFFIX.sub("", stem), []).append(path)
     if not recordings:
         raise RecordingError(f"{folder} holds no recording (a video, a bag or a folder of images); check the path")
-    for kind, by_stem in (("recordings", recordings), ("tables of forces", tables)):
-        for stem, same_name in by_stem.items():
-            if len(same_name) > 1 and stem in recordings:
-                names = ", ".join(path.name for path in same_name)
-                several = f"{folder} has several {kind} named {stem} ({names})"
-                raise RecordingError(f"{several}; rename all but one, or list them in a manifest (CSV)")
-    rows = tuple(
+    for path, stem in recordings.items():
+        if len(several := tables.get(stem, ())) > 1:
+            names = " and ".join(table.name for table in several)
+            raise RecordingError(f"{path} has several tables of forces, {names}; rename all but one")
+    rows = (
         ManifestRow(trial=trial_name(stem), video=path, reading=ReadOptions(forces=tables.get(stem, [None])[0]))
-        for stem, (path,) in recordings.items()
+        for path, stem in recordings.items()
     )
-    return _require_unique(rows, folder)
+    return _require_unique(tuple(rows), folder)
 
 
 def read_rows(path: Path) -> tuple[ManifestRow, ...]:

@@ -153,7 +153,7 @@ def label_by_friction(labels: Labels, friction: float) -> Labels:
 class GroundTruth:
     """Ground truth of a simulated trial; pixel coordinates are (x, y), pixel centres at whole numbers.
 
-    Lengths that disagree, or a stick zone larger than the contact, are a `RecordingError`.
+    A stick zone larger than the contact is a `RecordingError`.
     """
 
     recipe: str  #: Hash of the recipe that made the trial.
@@ -169,11 +169,6 @@ class GroundTruth:
     """Contact of the skin as the camera sees it: 0 none, 1 slipping, 2 sticking."""
 
     def __post_init__(self) -> None:
-        for name in ("static_friction", "contact_radius_m", "stick_radius_m", "contact_map"):
-            if len(getattr(self, name)) != len(self.marker_px):
-                raise RecordingError(f"the truth has another number of frames of {name} than of markers; give as many")
-        if self.marker_px.shape[1:] != self.marker_rest_px.shape:
-            raise RecordingError("the truth has other markers at rest than in its frames; give each a place in both")
         if np.any(sticking := self.stick_radius_m > self.contact_radius_m):
             at = int(np.argmax(sticking))
             raise RecordingError(f"frame {at} sticks beyond its contact; make the stick radius at most the contact's")
@@ -195,9 +190,6 @@ class Recording(TrialFacts, Labels, Result):
         if self.frames.shape[1:] != self.reference.shape:
             raise RecordingError(f"trial {self.trial} has a reference of another size than frames; record both alike")
         self._require_consistent(count, self.trial)
-        if self.truth is not None and len(self.truth.marker_px) != count:
-            truth = len(self.truth.marker_px)
-            raise RecordingError(f"trial {self.trial} has {count} frames but the truth of {truth}; give that of each")
         require_rising(self.time_s, what=f"trial {self.trial}")
 
     def __len__(self) -> int:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sliplens.recordings.capture import Forces
-from sliplens.recordings.labelling import ForceAxes, Found
+from sliplens.recordings.labelling import ForceAxes
 from sliplens.recordings.labels.axes import ContactForces, apply_axes
 from sliplens.recordings.labels.margin import FoundLabels, label_trial
 from sliplens.recordings.options import LabelSettings
@@ -75,9 +75,6 @@ class Trial:
             noise_n=(noise_n, noise_n, noise_n),
             tare_sigma_n=(0.0, 0.0, 0.0),
             still_until_s=TOUCH_S,
-            normal_found=Found.DECLARED,
-            sign_found=Found.DECLARED,
-            tare_found=Found.DECLARED,
         )
         return apply_axes(self.forces(noise_n=noise_n, rng=rng), axes)
 

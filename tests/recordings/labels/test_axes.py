@@ -6,7 +6,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sliplens.errors import RecordingError
-from sliplens.recordings.labelling import Found
 from sliplens.recordings.labels.axes import apply_axes, infer_axes, magnitude
 from sliplens.recordings.options import LabelSettings
 
@@ -22,7 +21,6 @@ def test_axis_and_sign_come_back_however_the_sensor_is_mounted(
 ):
     axes = infer_axes(trial.forces(noise_n=0.02, rng=rng, tare_n=TARE, order=order, sign=sign))
     assert (axes.normal, axes.sign) == ("xyz"[order.index(0)], sign)
-    assert (axes.normal_found, axes.sign_found, axes.tare_found) == (Found.INFERRED,) * 3
     assert axes.notes == ()
 
 
@@ -48,7 +46,6 @@ def test_a_recording_that_begins_in_the_press_has_no_still_samples(trial: Trial,
     later = trial.time_s > TOUCH_S + 0.02
     begins = replace(trial, time_s=trial.time_s[later], contact_n=trial.contact_n[later])
     axes = infer_axes(begins.forces(noise_n=0.02, rng=rng))
-    assert axes.tare_found is Found.ASSUMED
     assert "no still samples before contact" in axes.notes[0]
     np.testing.assert_array_equal(axes.tare_n, 0)
 

@@ -61,8 +61,6 @@ def test_a_knock_that_the_image_does_not_see_is_no_slip(trial: Trial, rng: np.ra
     friction = estimate(forces, rng, image=seen)
     assert friction.onset_s == pytest.approx(SLIP_S, abs=0.01)
     assert friction.method == "break of F_t / F_n, seen in the image"
-    assert friction.image_sigmas is not None
-    assert friction.image_sigmas > 5
 
 
 def test_letting_go_is_no_slip(trial: Trial, trial_without_slip: Trial):

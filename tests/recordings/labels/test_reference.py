@@ -41,12 +41,11 @@ def test_the_least_energy_is_neither_shaken_nor_touched():
 
 def test_brightness_alone_is_no_contact():
     film = Film()
-    flicker, plain, touched = (
-        choose_reference(film.read, film.untouched, index=index).contact_energy or 0.0 for index in (3, 4, 12)
-    )
-    # the flickering frame is never the median of eight, and so stays further from it by its own noise, sqrt(9 / 7)
-    assert flicker == pytest.approx(plain, rel=0.3)
-    assert touched > 2 * plain
+    places = [2, 4, 12, 3, 5]
+    for place, brighter in zip(places, (-20, -10, 0, 0, 24), strict=True):  # the touched frame is of median brightness
+        film.frames[place] = (film.frames[place].astype(int) + brighter).clip(0, 255)
+    read = lambda numbers: film.frames[[places[number] for number in numbers]]  # noqa: E731
+    assert choose_reference(read, np.ones(5, dtype=bool)).index != places.index(12)
 
 
 def test_memory_does_not_grow_with_the_untouched_stretch():

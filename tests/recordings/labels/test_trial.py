@@ -7,7 +7,7 @@ import pytest
 from there import there
 
 from sliplens.errors import RecordingError
-from sliplens.recordings.labelling import Found, FrictionEstimate, Lag
+from sliplens.recordings.labelling import FrictionEstimate, Lag
 
 from .conftest import SLIP_S, STATIC, Trial
 
@@ -37,7 +37,7 @@ def test_what_is_declared_is_used(trial_without_slip: Trial):
     settings = {"normal_axis": "x", "normal_sign": 1, "tare": (0.0,) * 3, "mu": STATIC, "lag_ms": 10.0}
     labels = trial_without_slip.label(trial_without_slip.forces(), **settings)
     basis = labels.basis
-    assert (basis.axes.tare_found, basis.lag, basis.lag_applied) == (Found.DECLARED, Lag(lag_s=0.01, sigma_s=0.0), True)
+    assert (basis.lag, basis.lag_applied) == (Lag(lag_s=0.01, sigma_s=0.0), True)
     assert basis.friction == FrictionEstimate(mu=STATIC, low=STATIC, high=STATIC)
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
-from sliplens.recordings.labelling import AXES, ForceAxes, Found, Vector
+from sliplens.recordings.labelling import AXES, ForceAxes, Vector
 from sliplens.recordings.options import LabelSettings
 
 _WINDOW_S = 0.03  # time over which the force is averaged to find the touch: a press takes longer, a spike is shorter
@@ -127,15 +127,15 @@ def infer_axes(forces: Forces, settings: LabelSettings | None = None, *, moved_s
         never = f"{forces.source} never departs from its noise: no touch to infer the axes from"
         raise RecordingError(f"{never}; give --normal-axis, --normal-sign and --tare, or leave the trial out")
     still = forces.force_n[forces.time_s < until]
-    tare, tare_sigma, tare_found, notes = np.zeros(3), np.zeros(3), Found.ASSUMED, []
+    tare, tare_sigma, notes = np.zeros(3), np.zeros(3), []
     if tare_n is not None:
-        tare, tare_found = np.array(tare_n, dtype=np.float64), Found.DECLARED
+        tare = np.array(tare_n, dtype=np.float64)
     elif len(still) < _FEW_STILL:
         notes.append("no still samples before contact: the tare is taken as zero; declare it if the sensor has one")
     else:
-        (tare, tare_sigma), tare_found = _measure_tare(still, noise=noise), Found.INFERRED
+        tare, tare_sigma = _measure_tare(still, noise=noise)
     drift, drift_sigma = np.zeros(3), np.zeros(3)
-    if tare_found is not Found.ASSUMED and np.isfinite(touch):
+    if not notes and np.isfinite(touch):
         drift, drift_sigma = _find_drift(forces, tare, tare_sigma, noise=noise, until_s=until, moved_s=moved_s)
     press = np.zeros(3)  # the mean force while the object is pressed and held
     if np.isfinite(touch):
@@ -181,9 +181,6 @@ def infer_axes(forces: Forces, settings: LabelSettings | None = None, *, moved_s
         noise_n=_vector(noise),
         tare_sigma_n=_vector(tare_sigma),
         still_until_s=None if np.isinf(until) else until,
-        normal_found=Found.INFERRED if normal is None else Found.DECLARED,
-        sign_found=Found.INFERRED if sign is None else Found.DECLARED,
-        tare_found=tare_found,
         drift_n_s=_vector(drift),
         drift_sigma_n_s=_vector(drift_sigma),
         notes=tuple(notes),

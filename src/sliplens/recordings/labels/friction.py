@@ -237,7 +237,6 @@ def estimate_friction(
         found=origin,
         method=method,
         onset_s=first and first.time_s,
-        image_sigmas=first and _image_sigmas(image, first.time_s),
         later_onsets_s=tuple(slip.time_s for slip in slips[1:]),
     )
     notes, error = _find_contradictions(estimate, slips, mean, slip_s=slip_s, friction_change=friction_change)

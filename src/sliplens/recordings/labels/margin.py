@@ -190,8 +190,6 @@ def label_frames(
             lag=lag,
             lag_applied=apply_lag,
             contact_threshold_n=threshold,
-            window_s=window,
-            gap_s=gap,
             faults=() if screened is None else screened.faults,
         ),
     )

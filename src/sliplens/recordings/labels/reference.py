@@ -33,18 +33,17 @@ def choose_reference(
     """
     if index is not None and not 0 <= index < len(untouched):
         raise RecordingError(f"the reference is frame {index} of {len(untouched)}; name one from 0 on that is there")
+    if index is not None:
+        return ReferenceChoice(index=index, method="named")
     places = np.flatnonzero(untouched)
-    if not len(places) and index is None:
+    if not len(places):
         raise RecordingError("no frame is known to be untouched; name the reference frame by hand")
     before = places[places - places[:1] == np.arange(len(places))]
     compared = before[np.linspace(0, len(before) - 1, min(len(before), _COMPARED)).round().astype(int)].tolist()
-    needed: list[int] = sorted({*compared, *([] if index is None else [index])})
-    soft = dict(zip(needed, map(soften, read(needed)), strict=True))
-    middle = np.median(np.stack([soft[place] for place in compared or needed]), axis=0)
-    chosen, method = index, "named"
-    if chosen is None:
-        chosen, method = min(compared, key=lambda place: _energy(soft[place] - middle)), "least contact energy"
-    return ReferenceChoice(index=chosen, method=method, contact_energy=_energy(soft[chosen] - middle))
+    soft = list(map(soften, read(compared)))
+    middle = np.median(np.stack(soft), axis=0)
+    energies = [_energy(image - middle) for image in soft]
+    return ReferenceChoice(index=compared[int(np.argmin(energies))], method="least contact energy")
 
 
 def _energy(difference: Float[np.ndarray, "rows columns 3"]) -> float:
