@@ -16,7 +16,6 @@ from sliplens.recordings import ContactState, Recording
 from sliplens.recordings.labelling import (
     ForceAxes,
     ForceFault,
-    Found,
     FrictionEstimate,
     LabelBasis,
     Labelling,
@@ -52,7 +51,6 @@ FRICTION = FrictionEstimate(
     low=0.517,
     high=0.546,
     onset_s=1.97,
-    found=Found.INFERRED,
     method="break of F_t / F_n, seen in the image",
 )
 LAG = Lag(lag_s=0.015, sigma_s=0.009, correlation=0.87)
@@ -130,7 +128,7 @@ def test_words_hold_what_the_labels_rest_on():
         ({"lag": None}, "lag not estimated"),
         ({"lag": Lag(lag_s=0.1, sigma_s=0.1, correlation=0.2, doubt="they correlate too little")}, "lag unknown: they"),
         ({"lag_applied": True}, "15.0 ± 9.0 ms, taken off"),
-        ({"friction": replace(FRICTION, low=MU, high=MU, found=Found.DECLARED)}, "taken as exact"),
+        ({"friction": replace(FRICTION, low=MU, high=MU)}, "taken as exact"),
         ({"slip_s": None}, "no slip found"),
         ({"axes": replace(AXES, notes=("the normal axis is doubtful",))}, "▲ the normal axis is doubtful"),
     ],
@@ -223,9 +221,7 @@ def test_no_words_lie_over_others_or_leave_the_page(size):
         notes=["a note that tells of a doubt at some length, and of its cure"] * 30,
         slip_s=1970.1,
         lag=Lag(lag_s=-0.1, sigma_s=0.1, correlation=0.2, doubt="several lags fit alike " * 4),
-        friction=replace(
-            FRICTION, low=MU, high=MU, found=Found.DECLARED, method="given by hand, after three trials by eye"
-        ),
+        friction=replace(FRICTION, low=MU, high=MU, method="given by hand, after three trials by eye"),
         axes=replace(AXES, tare_n=(-1234.5, 2345.6, -3456.7), notes=("the normal axis is doubtful",)),
     )
 

@@ -12,15 +12,9 @@ from sliplens.friction import MOST_FRICTION
 from sliplens.recordings.options import LabelSettings, TrialSettings
 
 AXES = ("x", "y", "z")
+BY_HAND = "given by hand"  #: Method of a friction that the user gave.
 
 Vector: TypeAlias = tuple[float, float, float]  #: x, y, z of the force sensor, as recorded.
-
-
-class Found(StrEnum):
-    """Origin of a setting."""
-
-    DECLARED = "declared"
-    INFERRED = "inferred"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,8 +63,7 @@ class FrictionEstimate:
     low: float  #: Lower end of the coefficient's 68 % interval.
     high: float  #: Upper end of the coefficient's 68 % interval.
     onset_s: float | None = None  #: First gross slip, on the force sensor's clock; None where no slip is known.
-    found: Found = Found.DECLARED
-    method: str = "given by hand"  #: Method of the estimate, in words.
+    method: str = BY_HAND  #: Method of the estimate, in words.
     later_onsets_s: tuple[float, ...] = ()  #: Gross slips of later contacts, at most one each.
     notes: tuple[str, ...] = ()
     """Contradictions with the forces, a sentence each; they count as errors of the friction."""

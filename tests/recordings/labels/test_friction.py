@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sliplens.errors import RecordingError
-from sliplens.recordings.labelling import Found, FrictionEstimate
+from sliplens.recordings.labelling import FrictionEstimate
 from sliplens.recordings.labels.axes import ContactForces, apply_axes
 from sliplens.recordings.labels.friction import ImageMotion, estimate_friction, fit_break
 
@@ -127,7 +127,7 @@ def test_friction_and_slip_are_independent_facts(
     assert friction.onset_s == pytest.approx(SLIP_S, abs=0.01)
     assert friction.mu == pytest.approx(STATIC, rel=0.012)
     assert friction.notes == ()
-    assert friction.found is (Found.INFERRED if mu is None else Found.DECLARED)
+    assert (friction.method == "given by hand") == (mu is not None)
 
 
 @pytest.mark.parametrize(

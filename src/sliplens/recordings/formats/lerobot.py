@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from math import floor, prod
 from pathlib import Path
@@ -19,7 +19,7 @@ from sliplens.errors import RecordingError
 from sliplens.files import read_json
 from sliplens.recordings.capture import Capture, Forces, Frame
 from sliplens.recordings.formats.tables import trial_name
-from sliplens.recordings.formats.video import first_frame_size, loss_note, open_video, upright
+from sliplens.recordings.formats.video import open_video, read_size, upright
 from sliplens.recordings.options import ReadOptions
 
 _COPY = "copy the data set again"
@@ -72,10 +72,9 @@ def video_frames(
 def read_lerobot(folder: Path, options: ReadOptions) -> list[Capture]:
     """Read a data set, one trial an episode."""
     path = folder / "meta" / "info.json"
+    info = read_json(path, missing="name the folder of a LeRobot data set", damaged=_COPY)
     try:
-        layout = msgspec.convert(
-            read_json(path, missing="name the folder of a LeRobot data set", damaged=_COPY), Layout
-        )
+        layout = msgspec.convert(info, Layout)
     except msgspec.ValidationError as error:
         raise RecordingError(f"{path} is not that of LeRobot v3.0 ({error}); {_CONVERT}, or {_COPY}") from None
     camera, force = _choose_features(folder, layout, options)
@@ -89,7 +88,7 @@ def read_lerobot(folder: Path, options: ReadOptions) -> list[Capture]:
         raise RecordingError(f"{listed} lists no episode; record one, or copy it again")
     # episodes share files
     kinds = {"episode_index": "whole numbers", "timestamp": "numbers", **({force: "values"} if force else {})}
-    read_table, read_header = lru_cache(maxsize=1)(partial(_read_rows, columns=kinds)), cache(_read_header)
+    read_table, read_header = lru_cache(maxsize=1)(partial(_read_rows, columns=kinds)), cache(read_size)
     captures = []
     for episode, row in sorted(rows.items()):
         path, file = (
@@ -101,29 +100,25 @@ def read_lerobot(folder: Path, options: ReadOptions) -> list[Capture]:
             facts = f"{len(table)} frames of {source}, its metadata say {row['length']}, from {row[start]:g} s on"
             raise RecordingError(f"{path} has {facts} in the video; leave the episode out, or {_COPY}")
         time_s, (size, loss) = table.column("timestamp").to_numpy().astype(np.float64), read_header(file)
-        capture = Capture(
-            trial=trial_name(f"{folder.resolve().name}-{episode:06d}"),
-            source=f"{camera} of {source}",
-            frame_time_s=time_s,
-            frame_size=size,
-            read_frames=partial(video_frames, file, row[start] + time_s, tolerance_s=0.5 / layout.fps, frame_size=size),
-            notes=loss if force else (f"There are no forces: no feature of {folder} is named like one.", *loss),
-        )
+        forces, notes = None, (f"There are no forces: no feature of {folder} is named like one.", *loss)
         if force:
             column, width = table.column(force).combine_chunks(), prod(layout.features[force].shape)
             numbers = column.flatten() if hasattr(column, "flatten") else column
             if len(numbers) != len(table) * width or numbers.null_count or not pa.types.is_floating(numbers.type):
                 raise RecordingError(f"{force} of {path} does not hold {width} numbers a frame; {_COPY}")
             force_n = numbers.to_numpy().astype(np.float64).reshape(-1, width)[:, :3].copy()
-            forces = Forces(time_s=time_s, force_n=force_n, source=f"{force} of {source}")
-            capture = replace(capture, forces=forces)
+            forces, notes = Forces(time_s=time_s, force_n=force_n, source=f"{force} of {source}"), loss
+        capture = Capture(
+            trial=trial_name(f"{folder.resolve().name}-{episode:06d}"),
+            source=f"{camera} of {source}",
+            frame_time_s=time_s,
+            frame_size=size,
+            read_frames=partial(video_frames, file, row[start] + time_s, tolerance_s=0.5 / layout.fps, frame_size=size),
+            forces=forces,
+            notes=notes,
+        )
         captures.append(capture)
     return captures
-
-
-def _read_header(path: Path) -> tuple[tuple[int, int], tuple[str, ...]]:
-    with open_video(path) as (_, stream):
-        return first_frame_size(path), loss_note(stream, name=path.name)
 
 
 def _choose_features(folder: Path, layout: Layout, options: ReadOptions) -> tuple[str, str | None]:

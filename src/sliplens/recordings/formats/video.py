@@ -84,19 +84,15 @@ def upright(
     return np.ascontiguousarray(pixels[:: -1 if b + d < 0 else 1, :: -1 if a + c < 0 else 1])
 
 
-def first_frame_size(path: Path) -> tuple[int, int]:
-    """Return height and width of the upright frames of a video, from the first."""
+def read_size(path: Path) -> tuple[tuple[int, int], tuple[str, ...]]:
+    """Return height and width of the upright frames of a video, from the first, and a note if its coding has loss."""
     with open_video(path) as (container, video):
+        codec = video.codec_context.codec
+        loss = f"{path.name}: frames are coded with loss ({codec.canonical_name}), which moves markers a little"
         for frame in container.decode(video):
-            return upright(frame, frame.to_ndarray(format="rgb24"), where=path).shape[:2]
+            size = upright(frame, frame.to_ndarray(format="rgb24"), where=path).shape[:2]
+            return size, (f"{loss}; record losslessly (FFV1, PNG) where you can.",) if codec.lossy else ()
     raise RecordingError(f"{path} holds no frame; record it again")
-
-
-def loss_note(video: VideoStream, *, name: str) -> tuple[str, ...]:
-    """Return a note if frames are coded with loss."""
-    codec = video.codec_context.codec
-    loss = f"{name}: frames are coded with loss ({codec.canonical_name}), which moves markers a little"
-    return (f"{loss}; record losslessly (FFV1, PNG) where you can.",) if codec.lossy else ()
 
 
 def _ends_early(
@@ -149,7 +145,7 @@ def read_video(path: Path, options: ReadOptions) -> Capture:
     Of a video that was cut off, the frames up to the cut are kept.
     """
     packets: list[int | None] = []
-    cut, stamps, time_s = False, None, None
+    cut, stamps, time_s, notes = False, None, None, list[str]()
     with open_video(path) as (container, video):
         # AVI counts frames; the presentation stamps made up from that are late where frames are reordered
         counted = container.format.name == "avi"
@@ -167,13 +163,12 @@ def read_video(path: Path, options: ReadOptions) -> Capture:
             zero = stamps[0] if container.format.name in {"mpegts", "mpeg"} else 0
             time_s = (stamps - zero) * float(video.time_base)
         cut |= _ends_early(container, video, len(packets), time_s)
-        notes = list(loss_note(video, name=path.name))
         if (streams := len(_moving(container))) > 1:
             notes.append(f"{path.name}: the first of {streams} video streams was read.")
         pixels = video.codec_context.format
         if pixels is not None and max(part.bits for part in pixels.components) > 8:
             notes.append(f"{path.name}: frames have more than 8 bits a channel and were reduced to 8.")
-    size, frames = first_frame_size(path), len(packets)
+    (size, loss), frames = read_size(path), len(packets)
     decode = partial(_decode, path, frames=frames, stamps=None if counted else stamps, size=size)
     if cut:
         frames, decoded = 0, decode()
@@ -200,5 +195,5 @@ def read_video(path: Path, options: ReadOptions) -> Capture:
         frame_size=size,
         read_frames=lambda: islice(decode(), skipped, frames if cut else None),
         forces=samples,
-        notes=(*notes, *more),
+        notes=(*loss, *notes, *more),
     )

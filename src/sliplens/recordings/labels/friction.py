@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sliplens.errors import RecordingError
-from sliplens.recordings.labelling import Found, FrictionEstimate
+from sliplens.recordings.labelling import BY_HAND, FrictionEstimate
 from sliplens.recordings.labels import axes
 from sliplens.recordings.labels.axes import ContactForces, Samples, Times
 
@@ -217,13 +217,12 @@ def estimate_friction(
     mean = max(means, key=lambda mean: float(mean.least.max()))
     first = slips[0] if slips else None
     if mu is not None:
-        low, high, origin, method = mu, mu, Found.DECLARED, "given by hand"
+        low, high, method = mu, mu, BY_HAND
     elif first is None or first.mu is None:
         never = f"the trial never slips (F_t / F_n reaches {mean.ratio[mean.least.argmax()]:.2f} without breaking off)"
         raise RecordingError(f"{never}, so its friction is unknown; give it with --mu, or in a manifest")
     else:
-        mu, low, high = first.mu, first.low, first.high
-        origin, method = Found.INFERRED, "F_t / F_n at the slip set by hand"
+        mu, low, high, method = first.mu, first.low, first.high, "F_t / F_n at the slip set by hand"
         if low <= 0:
             interval = f"{mu:.2g} with a 68 % interval from {low:.2g} to {high:.2g}, which is none"
             raise RecordingError(f"the slip at {first.time_s:.2f} s gives a friction of {interval}; give it with --mu")
@@ -234,7 +233,6 @@ def estimate_friction(
         mu=mu,
         low=low,
         high=high,
-        found=origin,
         method=method,
         onset_s=first and first.time_s,
         later_onsets_s=tuple(slip.time_s for slip in slips[1:]),
@@ -256,7 +254,7 @@ def _find_contradictions(
     friction_change: float,
 ) -> tuple[list[str], float]:
     """Compare a friction with the forces; returns the contradictions, and the error of the friction for them."""
-    mu, declared, ratio, time = friction.mu, friction.found is Found.DECLARED, means.ratio, means.time_s
+    mu, declared, ratio, time = friction.mu, friction.method == BY_HAND, means.ratio, means.time_s
     written = f"{mu:.2f}" if declared else f"{mu:.2f} ({friction.low:.2f} to {friction.high:.2f})"
     notes, error, counts = [], 0.0, "whose difference counts as an error of the friction"
     if declared and slips and slips[0].mu is not None:

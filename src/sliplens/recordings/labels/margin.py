@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from sliplens.errors import RecordingError
 from sliplens.mechanics import safety_margin, stick_ratio
 from sliplens.recordings.capture import Forces
-from sliplens.recordings.labelling import Found, FrictionEstimate, LabelBasis, Lag, Reason, describe_faults
+from sliplens.recordings.labelling import BY_HAND, FrictionEstimate, LabelBasis, Lag, Reason, describe_faults
 from sliplens.recordings.labels import axes
 from sliplens.recordings.labels.axes import ContactForces, Samples
 from sliplens.recordings.labels.faults import FAULTS, GAP_STEPS, MARKED, Screened, screen_trial
@@ -274,7 +274,7 @@ def _find_doubts(forces: ContactForces, basis: LabelBasis, *, frame_time_s: Fram
     low, high = _PLAUSIBLE_FRICTION
     usual = f"that of a fingertip lies between {low:g} and {high:g}"
     if not low <= friction.mu <= high:
-        if friction.found is Found.INFERRED:
+        if friction.method != BY_HAND:
             cure = "give --normal-axis, or --mu"
             raise RecordingError(f"the friction comes out as {friction.mu:.3g}, and {usual}; {cure}")
         doubts.append(f"a friction of {friction.mu:.3g} was given, and {usual}")
