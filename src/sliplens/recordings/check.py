@@ -1,9 +1,7 @@
 """Checks of a data set: its files against their hashes, its labels against their laws."""
 
-import os
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +13,7 @@ from sliplens.errors import InputError, SliplensError
 from sliplens.files import RUN_FILE, hash_file, read_json
 from sliplens.progress import OnProgress, add_note, report_each, reporting
 from sliplens.recordings.dataset import JOURNAL_FOLDER, Dataset, TrialInfo, load_dataset, report_flags, trial_path
-from sliplens.recordings.store import forces_path, hash_frames, load_recording, read_header, stream_frames
+from sliplens.recordings.store import forces_path, hash_frames, in_turn, load_recording, read_header, stream_frames
 from sliplens.recordings.trial import SIGNALS, ContactState, Recording
 
 # margins are stored in double precision; labels made in single precision may differ by this much from their forces
@@ -79,8 +77,8 @@ def check_dataset(
         unfinished = "still runs or was cut off; finish it with sliplens recover"
         violations.append(Violation(where=JOURNAL_FOLDER, what=unfinished))
     # hashes and decoding release the interpreter's lock
-    with ThreadPoolExecutor(os.cpu_count()) as pool, reporting(on_progress):
-        checked = pool.map(lambda info: tuple(_check_trial(folder, info)), data.trials)
+    with reporting(on_progress):
+        checked = in_turn(lambda info: tuple(_check_trial(folder, info)), data.trials)
         for info, errors in zip(report_each(data.trials), checked, strict=True):
             violations += [Violation(where=info.trial, what=error) for error in errors]
             with suppress(SliplensError):  # an unreadable file is among the violations

@@ -77,7 +77,7 @@ def test_a_camera_is_found_by_its_name_or_named(dataset, frames):
     write_info(dataset, lambda info: info["features"].update(gelsight=info["features"][CAMERA]))
     refused(read_lerobot, dataset, "has 2 cameras among .*gelsight.*; name one with --camera-key")
     write_info(dataset, lambda info: [info["features"].pop(key) for key in (CAMERA, SCENE)])
-    refused(read_lerobot, dataset, "press v3 has no cameras among")
+    refused(read_lerobot, dataset, "press v3 has no camera")
 
 
 def test_a_force_is_found_by_its_name_or_named(dataset):

@@ -254,13 +254,13 @@ def test_of_several_topics_one_must_be_named(tmp_path, pixels, frames_of, wrench
     shown = [(raw_image(255 - image, frame_ns(i)), frame_ns(i)) for i, image in enumerate(pixels)]
     scenes = [(name, *frame) for frame in shown for name in ("/a", "/b")]
     path = write_bag(tmp_path / "trial", in_order(scenes, wrenches))
-    refused(read_rosbag, path, r"has 2 image topics, /a \(sensor_msgs/msg/Image\), /b \(.*\); name one of them with")
+    refused(read_rosbag, path, "has 2 image topics among /a, /b; name one with --image-topic")
     refused(read_rosbag, path, r"has no image topic /wrench", image_topic=FORCE)
     frames = read_rosbag(path, image_topic="/b", wrench_topic=FORCE).read_frames()
     np.testing.assert_array_equal(list(frames), 255 - pixels)
     left = [("/left", message, time_ns) for _, message, time_ns in wrenches]
     path = write_bag(tmp_path / "two", in_order(frames_of(), left, wrenches))
-    refused(read_rosbag, path, r"has 2 wrench topics, /left .*, /wrench .*; name one of them")
+    refused(read_rosbag, path, "has 2 wrench topics among /left, /wrench; name one with")
 
 
 @pytest.mark.parametrize("storage", ["MCAP", "SQLITE3"])

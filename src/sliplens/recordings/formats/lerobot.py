@@ -20,7 +20,7 @@ from sliplens.files import read_json
 from sliplens.recordings.capture import Capture, Forces, Frame
 from sliplens.recordings.formats.tables import trial_name
 from sliplens.recordings.formats.video import open_video, read_size, upright
-from sliplens.recordings.options import ReadOptions
+from sliplens.recordings.options import ReadOptions, choose_named
 
 _COPY = "copy the data set again"
 _CONVERT = "convert an older one with `python -m lerobot.scripts.convert_dataset_v21_to_v30`"
@@ -127,19 +127,16 @@ def _choose_features(folder: Path, layout: Layout, options: ReadOptions) -> tupl
     wrenches = [key for key, each in floats.items() if each.shape in ((3,), (6,))]
     cameras = [key for key, each in layout.features.items() if each.dtype == "video"]
     tactile, forces = [*filter(_TACTILE.search, cameras)], [*filter(_FORCE.search, wrenches)]
-    chosen = []
-    for kind, name, fitting, likely in (
-        ("camera", options.camera_key, cameras, tactile or cameras),
-        ("force", options.force_key, wrenches, forces),
-    ):
-        keys = likely if name is None else [key for key in fitting if key == name]
-        if len(keys) != 1 and (keys or name or kind == "camera"):
-            wanted = f"no {kind} {name}" if name else f"{len(keys) or 'no'} {kind}s"
-            raise RecordingError(f"{folder} has {wanted} among {fitting}; name one with --{kind}-key")
-        chosen.append(next(iter(keys), None))
-    camera, force = chosen
-    if trial_name(camera) != camera:
-        raise RecordingError(f"the camera {camera[:40]!r} of {folder} cannot name a folder; copy one you trust")
+    camera, force = (
+        choose_named(folder, fitting, name, likely=likely, what=what, option=f"--{what}-key")
+        for what, name, fitting, likely in (
+            ("camera", options.camera_key, cameras, tactile or cameras),
+            ("force", options.force_key, wrenches, forces),
+        )
+    )
+    if camera is None or trial_name(camera) != camera:
+        wrong = f"the camera {camera[:40]!r} of {folder} cannot name a folder" if camera else f"{folder} has no camera"
+        raise RecordingError(f"{wrong}; copy one you trust")
     # names of the numbers are a list, or lists by group
     first = re.findall(r"'(\w[^']*)'(?!: \[)", str(layout.features[force].names))[:3] if force else []
     if any(map(_TORQUE.search, first)):

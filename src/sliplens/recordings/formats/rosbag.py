@@ -16,7 +16,7 @@ from sliplens.files import require_file
 from sliplens.images import image_size, read_image
 from sliplens.recordings.capture import Capture, Forces, Frame
 from sliplens.recordings.formats.tables import trial_name
-from sliplens.recordings.options import ReadOptions
+from sliplens.recordings.options import ReadOptions, choose_named
 
 if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader
@@ -113,10 +113,14 @@ def read_rosbag(path: Path, options: ReadOptions) -> Capture:
     notes, size = [], None
     with open_bag(path) as bag:
         topics = {connection.topic: connection.msgtype for connection in bag.connections}
-    images = _choose(topics, options.image_topic, what="image", path=path)
-    wrenches = _choose(topics, options.wrench_topic, what="wrench", path=path)
+    images, wrenches = (
+        choose_named(path, fitting, name, likely=fitting, what=f"{what} topic", option=f"--{what}-topic")
+        for what, name in (("image", options.image_topic), ("wrench", options.wrench_topic))
+        for fitting in [[topic for topic, kind in topics.items() if kind in _TYPES[what]]]
+    )
     if images is None:
-        raise RecordingError(f"{path} has no topic with images; record the camera too (it has {_list_topics(topics)})")
+        listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items())) or "no topic"
+        raise RecordingError(f"{path} has no topic with images; record the camera too (it has {listed})")
     chosen = [images] if wrenches is None else [images, wrenches]
     # an hour at 1 kHz is 100 MB
     stamps_ns = {name: {clock: array("q") for clock in _CLOCKS} for name in chosen}
@@ -174,17 +178,6 @@ def _read_frames(path: Path, images: str, kind: str) -> Iterator[Frame]:
         yield np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 else pixels
 
 
-def _choose(topics: Mapping[str, str], name: str | None, *, what: str, path: Path) -> str | None:
-    """Return the topic `name`, or the only one of the fitting types."""
-    fitting = {topic: kind for topic, kind in topics.items() if kind in _TYPES[what]}
-    if name is not None and name not in fitting:
-        raise RecordingError(f"{path} has no {what} topic {name}; it has {_list_topics(topics)}")
-    if name is None and len(fitting) > 1:
-        several = f"{len(fitting)} {what} topics, {_list_topics(fitting)}"
-        raise RecordingError(f"{path} has {several}; name one of them with --{what}-topic")
-    return name or next(iter(fitting), None)
-
-
 def _choose_clock(topics: Mapping[str, Mapping[str, array]]) -> tuple[str, list[str]]:
     """Choose the clock that all topics have, "header" or "bag", with a note where it is not the header's."""
     instead = "times are those at which the bag received the messages."
@@ -199,7 +192,3 @@ def _choose_clock(topics: Mapping[str, Mapping[str, array]]) -> tuple[str, list[
     if len(topics) == 2 and not meet("header") and meet("bag"):
         return "bag", [f"The header stamps of {' and '.join(topics)} are of different clocks: {instead}"]
     return "header", []
-
-
-def _list_topics(topics: Mapping[str, str]) -> str:
-    return ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items())) or "no topic"
