@@ -13,6 +13,7 @@ from sliplens.errors import InputError, SliplensError
 from sliplens.files import RUN_FILE, hash_file, read_json
 from sliplens.progress import OnProgress, add_note, report_each, reporting
 from sliplens.recordings.dataset import JOURNAL_FOLDER, Dataset, TrialInfo, load_dataset, report_flags, trial_path
+from sliplens.recordings.labels.friction import LAW_SIGMAS, PRESSED_SHARE
 from sliplens.recordings.store import forces_path, hash_frames, in_turn, load_recording, read_header, stream_frames
 from sliplens.recordings.trial import SIGNALS, ContactState, Recording
 
@@ -165,16 +166,12 @@ def _check_laws(recording: Recording) -> Iterator[str]:
             yield f"frame {int(np.argmax(wrong))}: {law}{count}"
 
 
-_LAW_SIGMAS = 3.0
-_PRESSED_SHARE = 0.25  # of the largest normal force: in a lighter touch F_t / F_n is all noise
-
-
 def _check_friction(
     recording: Recording, *, slips: Bool[np.ndarray, " frames"]
 ) -> dict[str, Bool[np.ndarray, " frames"]]:
     """Find the frames whose F_t / F_n exceeds the static friction by more than 3 sigma, before a slip and after it."""
     normal, coefficient = recording.normal_force_n, recording.friction_coefficient
-    pressed = normal > _PRESSED_SHARE * np.nanmax(normal, initial=0.0)
+    pressed = normal > PRESSED_SHARE * np.nanmax(normal, initial=0.0)
     ratio = np.where(pressed, recording.tangential_force_n / np.where(pressed, normal, 1), np.nan)
     sigma = np.zeros(len(normal)) if recording.safety_margin_sigma is None else recording.safety_margin_sigma
     basis = recording.labelling.basis if recording.labelling else None
@@ -182,7 +179,7 @@ def _check_friction(
     sigma = np.maximum(np.nan_to_num(sigma), basis.friction.sigma / basis.friction.mu if basis else 0.0)
     # the last frame before a slip has the friction that holds until then
     last = np.maximum.accumulate(np.where(recording.labelled & ~slips, np.arange(len(normal)), -1))
-    most = (coefficient * (1 + _LAW_SIGMAS * sigma))[last] + _ROUNDING
+    most = (coefficient * (1 + LAW_SIGMAS * sigma))[last] + _ROUNDING
     beyond = (last >= 0) & (ratio > most)
     # exact labels may have a friction that changes from frame to frame: until the slip it may have grown
     estimated = recording.safety_margin_sigma is not None

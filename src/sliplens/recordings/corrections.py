@@ -58,8 +58,6 @@ def read_corrections(path: Path | str) -> dict[str, Corrections]:
     require_file(path, most=MOST_TEXT, missing="write one with `sliplens label DATA --draft corrections.csv`")
     corrections: dict[str, Corrections] = {}
     for where, cells in read_csv(path, _COLUMNS, what="a table of corrections", needed="trial"):
-        if cells["trial"] in corrections:
-            raise RecordingError(f"{where}: {cells['trial']} has a row already; write one row a trial")
         settings = dict(parse_cells({name: text for name, text in cells.items() if name in _SETTINGS}, _COLUMNS, where))
         try:
             corrections[cells["trial"]] = Corrections(**settings)

@@ -129,7 +129,7 @@ def _read_header(path: Path) -> tuple[list[str], str]:
 
 def read_csv(path: Path, columns: Collection[str], *, what: str, needed: str) -> Iterator[tuple[str, dict[str, str]]]:
     """Read a table that a person wrote; yields the place of each row and its cells that are not empty, by column."""
-    names, delimiter = _read_header(path)
+    (names, delimiter), seen = _read_header(path), set[str]()
     if unknown := [name for name in names if name not in columns]:
         raise RecordingError(f"{path} has a column {unknown[0]!r}; {what} has {', '.join(columns)}")
     try:
@@ -143,7 +143,10 @@ def read_csv(path: Path, columns: Collection[str], *, what: str, needed: str) ->
                 filled = {name: cell.strip() for name, cell in zip(names, cells, strict=False) if cell.strip()}
                 if filled and needed not in filled:
                     raise RecordingError(f"{where}: the column {needed} is empty; write one row a trial and name it")
+                if needed == "trial" and filled and filled["trial"] in seen:
+                    raise RecordingError(f"{where}: {filled['trial']} has a row already; write one row a trial")
                 if filled:
+                    seen.add(filled[needed])
                     yield where, filled
     except (UnicodeDecodeError, csv.Error, StopIteration) as error:
         raise RecordingError(f"{path} cannot be read as CSV ({error}); export it again as UTF-8") from None

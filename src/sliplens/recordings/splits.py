@@ -41,8 +41,6 @@ def read_split_table(path: Path) -> dict[str, str]:
     table: dict[str, str] = {}
     for where, cells in read_csv(path, ("trial", "split"), what="a table of splits", needed="trial"):
         trial, split = cells["trial"], cells.get("split", "")
-        if trial in table:
-            raise RecordingError(f"{where}: {trial} has a row already; write one row a trial")
         if not _SPLIT_NAME.fullmatch(split):
             raise RecordingError(f"{where}: split is {split!r}; use a lower-case word such as train or test")
         table[trial] = split

@@ -77,7 +77,7 @@ def read_lerobot(folder: Path, options: ReadOptions) -> list[Capture]:
         layout = msgspec.convert(info, Layout)
     except msgspec.ValidationError as error:
         raise RecordingError(f"{path} is not that of LeRobot v3.0 ({error}); {_CONVERT}, or {_COPY}") from None
-    camera, force = _choose_features(folder, layout, options)
+    camera, force = _choose_features(folder, layout.features, options)
     start, video = f"videos/{camera}/from_timestamp", f"videos/{camera}"
     whole = [f"{kind}/{place}" for kind in ("data", video) for place in ("chunk_index", "file_index")]
     columns = dict.fromkeys(("episode_index", "length", *whole), "whole numbers") | {start: "numbers"}
@@ -121,11 +121,10 @@ def read_lerobot(folder: Path, options: ReadOptions) -> list[Capture]:
     return captures
 
 
-def _choose_features(folder: Path, layout: Layout, options: ReadOptions) -> tuple[str, str | None]:
+def _choose_features(folder: Path, features: dict[str, Feature], options: ReadOptions) -> tuple[str, str | None]:
     """Return the camera, and the feature of forces, None where no name is like that of one."""
-    floats = {key: each for key, each in layout.features.items() if each.dtype.startswith("float")}
-    wrenches = [key for key, each in floats.items() if each.shape in ((3,), (6,))]
-    cameras = [key for key, each in layout.features.items() if each.dtype == "video"]
+    wrenches = [key for key, each in features.items() if each.dtype[:5] == "float" and each.shape in ((3,), (6,))]
+    cameras = [key for key, each in features.items() if each.dtype == "video"]
     tactile, forces = [*filter(_TACTILE.search, cameras)], [*filter(_FORCE.search, wrenches)]
     camera, force = (
         choose_named(folder, fitting, name, likely=likely, what=what, option=f"--{what}-key")
@@ -138,7 +137,7 @@ def _choose_features(folder: Path, layout: Layout, options: ReadOptions) -> tupl
         wrong = f"the camera {camera[:40]!r} of {folder} cannot name a folder" if camera else f"{folder} has no camera"
         raise RecordingError(f"{wrong}; copy one you trust")
     # names of the numbers are a list, or lists by group
-    first = re.findall(r"'(\w[^']*)'(?!: \[)", str(layout.features[force].names))[:3] if force else []
+    first = re.findall(r"'(\w[^']*)'(?!: \[)", str(features[force].names))[:3] if force else []
     if any(map(_TORQUE.search, first)):
         raise RecordingError(f"{force} of {folder} begins with {', '.join(first)}; forces must come first")
     return camera, force

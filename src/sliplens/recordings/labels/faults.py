@@ -12,7 +12,7 @@ from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.labelling import ForceFault, Lag, Reason
 from sliplens.recordings.labels import axes
-from sliplens.recordings.labels.lag import estimate_lag, force_changes
+from sliplens.recordings.labels.lag import LONGEST_LAG_S, estimate_lag, force_changes
 from sliplens.recordings.options import LabelSettings
 from sliplens.recordings.trial import MOST_FORCE_N
 
@@ -41,7 +41,6 @@ _TILTED_SHARE = 0.2  # of a fall of the pull that may show along the normal: axe
 _REST_SHARE, _RELEASE_S = 0.1, 0.3  # of the load of a released object; longest release that looks like jumps
 _SLIP_S = 0.1  # largest distance of a slip set by hand from its jump
 _BRIEF_S = 0.1  # a fault as short as this has ended when the force is back near its former value
-_LONGEST_LAG_S = 0.25  # search range for the image motion at a jump if the lag is unknown
 _ROUNDING = 1e-6  # of a mean of flags that are all 0
 _COARSE = 1.1  # mean length of runs of equal samples: more are coarse or repeated
 _ROUNDS = 3  # a large fault hides small ones
@@ -418,7 +417,7 @@ def _make_motion_test(frame_time_s: Times, image_motion: Times, forces: Forces, 
         return lambda _t, _n: True  # without frames the force is believed
     lag_s, step = 0.0 if lag.doubt else lag.lag_s, axes.typical_step(frame_time_s)
     change_n = np.append(0.0, np.nan_to_num(force_changes(frame_time_s - lag_s, forces)))
-    reach_s = _LONGEST_LAG_S if lag.doubt else 2 * lag.sigma_s + 1.5 * step
+    reach_s = LONGEST_LAG_S if lag.doubt else 2 * lag.sigma_s + 1.5 * step
     motion, base = image_motion[1:], float(np.quantile(image_motion[1:], 0.1))
     moving = change_n >= np.quantile(change_n[1:], _PULLED)
     moving[0] = False

@@ -111,7 +111,7 @@ _WINDOWS_S = (0.03, 0.1)  # over which forces are averaged to find a break rough
 # a fall of the averaged ratio is significant by its noise, and by its size: less is a wobble of the hand that pulls
 _DROP_SIGMAS, _DROP_SHARE = 5.0, 0.03
 _DROP_S = 0.25  # time in which the ratio must have fallen: slip is sudden, a release is slow
-_PRESSED_SHARE = 0.25  # of the largest normal force: in a lighter touch the ratio is all noise
+PRESSED_SHARE = 0.25  # of the largest normal force: in a lighter touch the ratio is all noise
 _STEP_S = 0.06  # time over which the ratio before and after a fall is compared to place it
 _NORMAL_SHARE = 0.5  # of the normal force that stays in a slip; less stays in a release
 _SUDDEN = 1.5  # the fall of a slip is so many times that in as long a time before or after it
@@ -124,7 +124,7 @@ _LIKE_SHARE, _LIKE_SIGMAS = 0.02, 5.0  # a parabola that ends this far from the 
 _BEFORE_STEPS, _AFTER_STEPS = 12, 6  # and of slow samples at least so many
 _BAND = (0.16, 0.84)  # quantiles that hold 68 %
 _IMAGE_SIGMAS, _QUIET_S = 3.0, 0.5  # image motion that shows the slip, against that of so long a time before
-_LAW_SIGMAS, _LAW_SHARE = 3.0, 0.01  # a ratio contradicts the friction by more of both: a break lies between samples
+LAW_SIGMAS, _LAW_SHARE = 3.0, 0.01  # a ratio contradicts the friction by more of both: a break lies between samples
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,7 +162,7 @@ def find_contacts(forces: ContactForces, *, contact_threshold_n: float) -> tuple
     """Find the contacts: spans of time, in seconds, each from a touch to its release; light or short ones are none."""
     time = forces.time_s
     normal = axes.mean_force(time, forces.normal_n, time, window_s=_STEP_S)
-    spans, least = axes.find_spans(time, normal > contact_threshold_n, apart_s=_APART_S), _PRESSED_SHARE * normal.max()
+    spans, least = axes.find_spans(time, normal > contact_threshold_n, apart_s=_APART_S), PRESSED_SHARE * normal.max()
     return tuple((float(time[start]), float(time[end - 1])) for start, end in spans if normal[start:end].max() >= least)
 
 
@@ -259,7 +259,7 @@ def _find_contradictions(
     notes, error, counts = [], 0.0, "whose difference counts as an error of the friction"
     if declared and slips and slips[0].mu is not None:
         first, apart = slips[0], abs(slips[0].mu - mu)
-        if apart > max(_LAW_SIGMAS * (first.high - first.low) / 2, _LAW_SHARE * mu):
+        if apart > max(LAW_SIGMAS * (first.high - first.low) / 2, _LAW_SHARE * mu):
             slip = (
                 f"F_t / F_n is {first.mu:.2f} ({first.low:.2f} to {first.high:.2f}) at the slip at {first.time_s:.2f} s"
             )
@@ -272,7 +272,7 @@ def _find_contradictions(
     begin = float(time[np.argmax(means.pulled)])
     far = 1.0 if onset_s is None else abs(float(time[highest]) - onset_s) / max(onset_s - begin, 1e-9)
     sigma = np.hypot(sigma, friction_change * min(far, 1.0) * mu)
-    if not notes and means.least[highest] > mu + max(_LAW_SIGMAS * sigma, _LAW_SHARE * mu):
+    if not notes and means.least[highest] > mu + max(LAW_SIGMAS * sigma, _LAW_SHARE * mu):
         when = "before" if onset_s is None or time[highest] < onset_s else "after"
         where = "nothing slips" if onset_s is None else f"{when} the slip at {onset_s:.2f} s"
         reaches = f"F_t / F_n reaches {ratio[highest]:.2f} at {time[highest]:.2f} s, {where}"
@@ -334,7 +334,7 @@ def _mean_ratio(forces: ContactForces, *, window_s: float, contact_threshold_n: 
     normal = axes.mean_force(time, forces.normal_n, time, window_s=window_s)
     normal_noise, noise = forces.noise_of_means_n(window_s)
     tangential = axes.magnitude(axes.mean_force(time, forces.tangential_n, time, window_s=window_s), sigma_n=noise)
-    pressed = normal > max(contact_threshold_n, _PRESSED_SHARE * normal.max())
+    pressed = normal > max(contact_threshold_n, PRESSED_SHARE * normal.max())
     # the window shrinks at the ends, where a single sample's noise is no fall
     pressed &= (time - time[0] >= window_s / 2) & (time[-1] - time >= window_s / 2)
     # without a contact nothing slips: a knock, where the contact was set by hand
@@ -377,7 +377,7 @@ def _find_falls(means: _MeanRatio, *, start_s: float, end_s: float, friction_cha
     soon = np.lib.stride_tricks.sliding_window_view(np.pad(falling, (count, 0)), count + 1).any(axis=1)
     tops = np.flatnonzero(soon & (steep > 0) & (steep == around.max(axis=1)))
     highest = float(means.least[inside].max())
-    allowed = max(_DROP_SHARE, _LAW_SIGMAS * friction_change)
+    allowed = max(_DROP_SHARE, LAW_SIGMAS * friction_change)
     falls = []
     for top in tops.tolist():
         if highest > float(means.ratio[max(0, top - 2 * beside) : top + 1].max()) * (1 + allowed):

@@ -61,6 +61,7 @@ def describe_repeats(motion: Float[np.ndarray, " frames"], time_s: Float[np.ndar
 Intervals: TypeAlias = Float[np.ndarray, " intervals"]
 # lags tried in the time of a frame, and least step between them; between them the peak is a parabola's
 _STEPS_A_FRAME, _LEAST_LAG_S = 16, 5e-4
+LONGEST_LAG_S = 0.25  #: Longest lag tried, either way.
 _BLOCKS = 24  # stretches of a trial that are resampled: long enough to hold a slip, many enough to draw from
 _LEAST_INTERVALS, _LEAST_CORRELATION = 2 * _BLOCKS, 0.3
 _OVERLAP = 0.7  # share of the frames that must have forces for a lag to be tried
@@ -79,7 +80,6 @@ def estimate_lag(
     forces: Forces,
     *,
     rng: np.random.Generator,
-    longest_s: float = 0.25,
     draws: int = 200,
 ) -> Lag:
     """Estimate the lag by cross-correlation of image motion and force rate, each frame keeping its own time.
@@ -88,11 +88,11 @@ def estimate_lag(
     image; it depends on neither axes, signs nor tare. A contact yields the more the lighter it is loaded, so the image
     leads the force in a press and trails it in a release; a release weighs no more than makes the two cancel. The
     uncertainty is the spread of the peak when stretches of the trial are resampled. With too few frames the lag is 0,
-    and its doubt says why. `longest_s` is the longest lag tried, either way.
+    and its doubt says why.
     """
-    reached = (frame_time_s >= forces.time_s[0] - longest_s) & (frame_time_s <= forces.time_s[-1] + longest_s)
+    reached = (frame_time_s >= forces.time_s[0] - LONGEST_LAG_S) & (frame_time_s <= forces.time_s[-1] + LONGEST_LAG_S)
     if not reached.any():
-        covers = f"no lag up to {longest_s:g} s lets the forces of {forces.source} cover the frames"
+        covers = f"no lag up to {LONGEST_LAG_S:g} s lets the forces of {forces.source} cover the frames"
         raise RecordingError(f"{covers}; bring both clocks to the same zero on import")
     frame_time_s, image_motion = frame_time_s[reached], image_motion[reached]
     intervals = len(frame_time_s) - 1
@@ -100,7 +100,7 @@ def estimate_lag(
         doubt = f"{intervals + 1} frames are too few to estimate a lag from, {_LEAST_INTERVALS + 1} are needed"
         return Lag(lag_s=0.0, sigma_s=0.0, doubt=doubt)
     step = max(typical_step(frame_time_s) / _STEPS_A_FRAME, _LEAST_LAG_S)
-    reach = int(np.ceil(longest_s / step))
+    reach = int(np.ceil(LONGEST_LAG_S / step))
     lags = np.arange(-reach, reach + 1) * step
     changes = np.stack([force_changes(frame_time_s - lag, forces) for lag in lags])
     covered = ~np.isnan(changes)
