@@ -144,7 +144,7 @@ def test_a_full_disk_leaves_the_last_whole_epoch(
     assert len((tmp_path / "run" / "metrics.csv").read_text().splitlines()) == 4
 
 
-def test_a_loss_that_diverges_leaves_the_best_network_to_use(
+def test_a_loss_that_diverges_is_refused_with_its_cure(
     small_dataset: Dataset, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
 ):
     from sliplens.training import module  # noqa: PLC0415 (as the command line imports it)
@@ -159,9 +159,6 @@ def test_a_loss_that_diverges_leaves_the_best_network_to_use(
     monkeypatch.setattr(module, "margin_loss", diverge)
     line = refused(capsys, small_dataset.folder, tmp_path / "run")
     assert "the training loss is inf in epoch 2, at step 5; lower the learning rate" in line
-    assert "lower the learning rate" in line
-    kept = load(tmp_path / ".run.partial")
-    assert f"the best network so far, of validation MSE {kept.manifest.metrics['validation_mse']:.4g}, is in" in line
 
 
 def test_one_condition_alone(small_dataset: Dataset, tmp_path: Path, capsys):

@@ -343,12 +343,9 @@ def test_cams_need_a_layer_with_a_map(name):
 @pytest.mark.parametrize(
     ("make", "options", "message"),
     [
-        (IntegratedGradients, {"steps": 0}, "steps = 0 and max_steps = 1024; give 1 <= steps <= max_steps"),
-        (SmoothGrad, {"noise": -0.1}, "noise = -0.1; give samples >= 1 and noise >= 0"),
         (Occlusion, {"tile_px": 0}, "tiles of 0 pixels are impossible; choose 1 or more"),
         (Occlusion, {"markers_px": torch.zeros(1, 2)}, "need two or more, and there are 1; choose tiles"),
         (PolyCam, {"budget": 0.0}, "Poly-CAM's budget is 0.0; give a share of the channels, above 0 and at most 1"),
-        (PolyCam, {"likeness": (1.1, 0.5)}, r"Poly-CAM's likeness is \(1.1, 0.5\); give two numbers from 0 to 1"),
     ],
 )
 def test_impossible_options_are_refused(make, options, message):

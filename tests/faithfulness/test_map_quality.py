@@ -4,7 +4,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sliplens.errors import InputError, SaliencyError
 from sliplens.faithfulness.controls import (
     infidelity,
     max_sensitivity,
@@ -37,9 +36,7 @@ def test_blobs_are_told_apart_as_far_as_they_are_narrow(spread: float):
     assert resolution(saliency, markers) == pytest.approx(max(expected, 0), abs=0.02)
 
 
-def test_resolution_needs_markers_and_relevance():
-    with pytest.raises(InputError, match="two markers or more"):
-        resolution(np.ones((5, 5)), np.array([[1.0, 1.0]]))
+def test_resolution_needs_relevance():
     assert np.isnan(resolution(np.zeros((9, 9)), np.array([[1.0, 1.0], [5.0, 5.0]])))
     assert resolution(np.ones((9, 9)), np.array([[1.0, 1.0], [5.0, 5.0]])) == 0
 
@@ -91,11 +88,5 @@ def test_a_map_that_knows_nothing_has_the_share_of_the_truth(seed: int):
     assert relevance_mass(flat, truth) == pytest.approx(truth.mean())
 
 
-def test_what_cannot_be_localised_is_refused(truth: np.ndarray):
-    with pytest.raises(InputError, match="the truth is nowhere"):
-        relevance_mass(np.ones((8, 10)), np.zeros((8, 10), dtype=bool))
-    with pytest.raises(InputError, match="without negative values"):
-        relevance_mass(-np.ones((8, 10)), truth)
-    with pytest.raises(SaliencyError, match=r"the map has shape \(3, 3\) but its image is 8 x 10"):
-        relevance_mass(np.ones((3, 3)), truth)
+def test_a_map_of_zeros_has_no_mass(truth: np.ndarray):
     assert np.isnan(relevance_mass(np.zeros((8, 10)), truth))

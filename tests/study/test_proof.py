@@ -41,7 +41,7 @@ def paint(network, recording, film, frame, weights):
 
 def test_the_fewest_markers_with_half_of_the_relevance_are_moved(scene):
     data, recording, frame, stick = scene
-    network, film = sl.load("thesis-difference"), rebuild_trial(data.folder, recording).film
+    network, film = sl.load("thesis-difference"), rebuild_trial(data.folder, recording)
 
     def weights(count: int) -> np.ndarray:
         values = np.full(count, -0.001)
@@ -70,7 +70,7 @@ def test_the_fewest_markers_with_half_of_the_relevance_are_moved(scene):
 
 def test_a_map_that_supports_nothing_and_a_trial_that_is_not_simulated_prove_nothing(scene):
     data, recording, frame, stick = scene
-    network, film = sl.load("thesis-difference"), rebuild_trial(data.folder, recording).film
+    network, film = sl.load("thesis-difference"), rebuild_trial(data.folder, recording)
     _, opposing = paint(network, recording, film, frame, lambda count: np.full(count, 0.1))
 
     def prove(trial: Recording, relevance: np.ndarray) -> object:

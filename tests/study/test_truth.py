@@ -163,7 +163,7 @@ def rows_of(truth: Truth, frame: str) -> list[dict]:
 def single_effects(trained: Network, explained: Explanation, data: Dataset, index: int) -> np.ndarray:
     """Prediction of a frame less that with each marker put back alone, drawn one by one."""
     frame = stage_frames(trained, explained, data)[index]
-    film, changed = frame.scene.film, []
+    film, changed = frame.film, []
     whole = trained.predict(network_inputs(trained, explained)[index, None])[0]
     for marker in visible_markers(CHROMATOUCH):
         back = np.zeros((1, len(film.marker_rest_px)), dtype=bool)
@@ -186,7 +186,7 @@ def test_shapley_values_of_a_linear_network_are_its_single_effects(two_signed, d
         # half a dozen markers at least speak for either side
         assert min((effects > 0).sum(), (effects < 0).sum()) > 5
         film, contact_map = (
-            frame.scene.film,
+            frame.film,
             data.load(data.find(frame.explained.trial)).truth.contact_map[frame.number],
         )
         for row in rows[::9]:
@@ -216,7 +216,7 @@ def test_neutral_effects_and_correlations_follow_from_frames_drawn_one_by_one(tr
     records = [make(index) for index in range(len(LEVELS))]
     rows = {(row["frame_id"], row["method"]): row for row in judging.join(records).neutral.to_arrow().to_pylist()}
     for index, (frame, record) in enumerate(zip(stage_frames(trained, explained, data), records, strict=True)):
-        film = frame.scene.film
+        film = frame.film
         stored = data.load(data.find(frame.explained.trial)).frames[frame.number]
         whole = trained.predict(trained.encode(stored[None], frame.reference))[0]
         effects, sums = [], []

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from sliplens.errors import ImageError, ModelError
 from sliplens.explainers.attribution import Approximation, Attribution
 from sliplens.models.engines import Engine, prepare
-from sliplens.models.wrapping import OneOutput
+from sliplens.models.wrapping import OneOutput, one_output
 from sliplens.progress import report_each
 from sliplens.results.explanation import CLOSE
 
@@ -65,19 +65,13 @@ class Comparison:
 
     def predict(self, images: Float[Tensor, "batch colours height width"]) -> Float[Tensor, " batch"]:
         """Run the network and return one margin an image, with the graph where gradients are on."""
-        output = self.model(images)
-        if not isinstance(output, Tensor) or tuple(output.shape) not in {(len(images),), (len(images), 1)}:
-            what = f"shape {tuple(output.shape)}" if isinstance(output, Tensor) else f"type {type(output).__name__}"
-            raise ModelError(
-                f"the model's output has {what} for {len(images)} image(s), not one number an image; end it with one "
-                "output, such as Linear(features, 1), or choose one with sliplens.wrap(model, output=0)"
-            )
+        output = one_output(self.model(images), len(images))
         if images.requires_grad and torch.is_grad_enabled() and not output.requires_grad:
             raise ModelError(
                 "the model's output has no gradient; take torch.no_grad() or detach() out of its forward pass, or use "
                 "occlusion, which needs none"
             )
-        return output.reshape(len(images))
+        return output
 
     @cached_property
     def prediction(self) -> Float[Tensor, " batch"]:

@@ -18,7 +18,7 @@ from sliplens.explainers.attribution import frame_of
 from sliplens.explainers.contract import Explainer
 from sliplens.explainers.frames import ChosenFrames, FindMarkers
 from sliplens.explainers.occlusion import KnownMarkers, RegionMethod, find_markers
-from sliplens.explainers.table import RECOMMENDED_METHOD, Option, get_explainer
+from sliplens.explainers.table import RECOMMENDED_METHOD, get_explainer
 from sliplens.models import Network
 from sliplens.models.engines import expecting
 from sliplens.progress import number_of, report_each
@@ -52,7 +52,7 @@ def choose_explainers(
             return explainers, (f"tiles, not markers: {error}",)
     inputs, explainers = network.encoding.normalise(chosen.images), {}
     free = torch.from_numpy(chosen.safety_margin >= _FULL_STICK)
-    options: dict[str, dict[str, Option]] = {
+    options: dict[str, dict[str, object]] = {
         "poly-cam": {"budget": budget},
         "expected-gradients": {"background": inputs[free] if free.any() else None},
     }

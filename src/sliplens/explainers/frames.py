@@ -231,8 +231,6 @@ def frames_at(
     """Choose frames of a data set by trial and number, those of a trial one after another."""
     infos, parts = {info.trial: info for info in data.trials}, []
     for trial, group in groupby(frames, key=lambda frame: frame[0]):
-        if trial not in infos:
-            raise RecordingError(f"{data.folder} has no trial {trial}; use the data set that the frames came from")
         (opened,), info = open_source(data, trial=trial), infos[trial]
         part = _take(network, opened, [number for _, number in group], source=data.source, baseline=baseline)
         ids = len(part.ids)
@@ -268,23 +266,25 @@ def frames_from_folder(
     `labels_in_names`, names that end in `_GG`, such as `image_433_20.png`, hold the safety margin in percent. If
     `baseline` is None, `stick` for a recording of several frames and `untouched` for a folder of images.
     """
-    parts, captures = [], open_source(folder, reference=reference, sensor=sensor)
-    for opened in captures:
+    parts = []
+    for opened in open_source(folder, reference=reference, sensor=sensor):
         default = "stick" if opened.files is None and len(opened) > 1 else "untouched"
         chosen = default if baseline is None else baseline
         part = _take(network, opened, range(len(opened)), source="real", baseline=chosen)
         part = replace(part, trial=(folder.name if opened.files else opened.trial,) * len(part.ids))
         if labels_in_names:
-            margin = np.array([_label(folder / name) for name in opened.files or part.ids], dtype=np.float32)
-            part = replace(part, safety_margin=margin)
+            margin = []
+            for name in part.ids:
+                if (label := _LABEL.search(name)) is None:
+                    raise InputError(
+                        f"{folder / name} carries no label; its name must end in the safety margin in percent, "
+                        "as in _20.png"
+                    )
+                margin.append(int(label[1]) / 100)
+            part = replace(part, safety_margin=np.array(margin, dtype=np.float32))
         parts.append(part)
 
-    def find_markers() -> list[Float[Tensor, "_markers 2"]]:
-        captures, size = open_source(folder, reference=reference, sensor=sensor), network.manifest.image_size
-        return [markers_in_frame(frame, image_size=size) for capture in captures for frame in capture.read_frames()]
-
-    show_markers = all(capture.read_reference is not None for capture in captures)
-    return replace(_join(parts), find_markers=find_markers if show_markers else None)
+    return _join(parts)
 
 
 def _take(
@@ -312,7 +312,6 @@ def _take(
         safety_margin=margin[list(numbers)].astype(np.float32),
         source=source,
         together=False,
-        find_markers=None,
         baseline=chosen.baseline if stick is None else "stick",
         baseline_frame=(stick,) * len(numbers),
         warnings=warnings,
@@ -321,20 +320,17 @@ def _take(
 
 def _join(parts: Sequence[ChosenFrames]) -> ChosenFrames:
     names = ("ids", "day", "trial", "condition", "baseline_frame", "warnings")
+    finders = [part.find_markers for part in parts if part.find_markers is not None]
     return replace(
         parts[0],
         **{name: sum((getattr(part, name) for part in parts), ()) for name in names},
         safety_margin=np.concatenate([part.safety_margin for part in parts]),
         images=torch.cat([part.images for part in parts]),
         references=torch.cat([part.references for part in parts]),
+        find_markers=(lambda: [places for find in finders for places in find()])
+        if len(finders) == len(parts)
+        else None,
         baseline=max(
             (part.baseline for part in parts), key=("black", "mean", "blurred", "untouched", "given", "stick").index
         ),
     )
-
-
-def _label(path: Path) -> float:
-    match = _LABEL.search(path.stem)
-    if match is None:
-        raise InputError(f"{path} carries no label; its name must end in the safety margin in percent, as in _20.png")
-    return int(match.group(1)) / 100

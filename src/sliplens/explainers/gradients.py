@@ -7,7 +7,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sliplens.errors import InputError
 from sliplens.explainers.attribution import Attribution, black_frames, frame_of, widest, with_reference_of
 from sliplens.explainers.contract import BATCH, Comparison, Method, require_images
 
@@ -53,13 +52,6 @@ class IntegratedGradients(Method):
     black: bool = False
     """Start from the black image instead, as published: relevance adds up to f(x) - f(black), and the reference only
     decides what `saliency` shows."""
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.steps <= self.max_steps:
-            raise InputError(
-                f"integrated gradients has steps = {self.steps} and max_steps = {self.max_steps}; "
-                "give 1 <= steps <= max_steps"
-            )
 
     def _explain(self, comparison: Comparison) -> Attribution:
         line, slopes = comparison, []
@@ -192,12 +184,6 @@ class SmoothGrad(Method):
     samples: int = 32
     noise: float = 0.1
     """Standard deviation of the noise, in units of the input's range [0, 1]; the same draws for each image."""
-
-    def __post_init__(self) -> None:
-        if self.samples < 1 or not self.noise >= 0:
-            raise InputError(
-                f"SmoothGrad has samples = {self.samples} and noise = {self.noise}; give samples >= 1 and noise >= 0"
-            )
 
     def _explain(self, comparison: Comparison) -> Attribution:
         from captum import attr  # noqa: PLC0415 (half a second, for some explainers alone)

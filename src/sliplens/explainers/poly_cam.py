@@ -149,8 +149,6 @@ class PolyCam(Method):
     def __post_init__(self) -> None:
         if not 0 < self.budget <= 1:
             raise InputError(f"Poly-CAM's budget is {self.budget}; give a share of the channels, above 0 and at most 1")
-        if self.likeness is not None and not all(0 <= value <= 1 for value in self.likeness):
-            raise InputError(f"Poly-CAM's likeness is {self.likeness}; give two numbers from 0 to 1")
 
     @torch.no_grad()
     def _explain(self, comparison: Comparison) -> Attribution:

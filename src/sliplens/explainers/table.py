@@ -73,11 +73,8 @@ An installed package adds an `ExplainerRow` by the entry point `sliplens.explain
 RECOMMENDED_METHOD = "shapley-marker"
 """Default method: its maps rank the markers most like the truth in simulation. Without markers, tiles (`shapley`)."""
 
-Option: TypeAlias = object
-"""Value of a field of an explainer."""
 
-
-def get_explainer(method: str, **options: Option) -> "Explainer":
+def get_explainer(method: str, **options: object) -> "Explainer":
     """Make the explainer of a row of `EXPLAINERS`, with some of its options (the fields of its class) changed.
 
     Raises

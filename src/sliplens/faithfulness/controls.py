@@ -14,11 +14,10 @@ from scipy.spatial import KDTree
 from torch import Tensor, nn
 from torch.nn import functional
 
-from sliplens.errors import InputError, ModelError
+from sliplens.errors import ModelError
 from sliplens.explainers.attribution import change_of, combine, frame_of, local_change, with_reference_of
 from sliplens.explainers.cam import capture, find_layers
 from sliplens.intervals import paired_difference
-from sliplens.results.explanation import require_saliency
 from sliplens.results.faithfulness import CHANCE, Lead
 
 _SAMPLES = 33
@@ -38,8 +37,6 @@ def resolution(saliency: Float[np.ndarray, "height width"], markers_px: Float[np
 
     Pairs of which one has no relevance are left out; NaN if there is no other.
     """
-    if len(markers_px) < 2:
-        raise InputError("resolution needs two markers or more")
     _, nearest = KDTree(markers_px).query(markers_px, k=2)
     pairs = {(min(first, second), max(first, second)) for first, second in np.asarray(nearest).tolist()}
     depths = []
@@ -113,11 +110,6 @@ def relevance_mass(saliency: Float[np.ndarray, "_ _"], truth: Bool[np.ndarray, "
 
     Arras, Osman and Samek, *CLEVR-XAI* (2022): relevance mass accuracy.
     """
-    require_saliency(saliency, truth.shape, where="the map")
-    if not truth.any():
-        raise InputError("the truth is nowhere in this frame; choose a frame in contact")
-    if saliency.min() < 0:
-        raise InputError("relevance mass needs a map without negative values; take its positive part or its size")
     total = float(saliency.sum())
     return float(saliency[truth].sum()) / total if total > 0 else float("nan")
 

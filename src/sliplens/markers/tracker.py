@@ -11,7 +11,6 @@ from sliplens.errors import ImageError, RecordingError
 from sliplens.markers.detect import MarkerKind, Markers, detect_markers, measure_markers
 from sliplens.markers.linking import Pairing, Pattern, Places
 
-_FEWEST = 4
 _RADIUS_CHANGE = (0.6, 1.6)  # of the radius at rest, over the median change of all markers
 _CONTRAST_LEFT = 0.45
 _ROUNDNESS_LEFT, _ROUND = 0.75, 0.7
@@ -66,10 +65,6 @@ class Tracker:
     def __init__(self, reference: UInt8[np.ndarray, "height width 3"], kind: str | MarkerKind = "auto") -> None:
         detected = detect_markers(reference, kind)
         self.rest = detected.only(detected.whole)
-        if len(self.rest) < _FEWEST:
-            raise ImageError(
-                f"the reference shows {len(self.rest)} whole markers, at least {_FEWEST} are needed; name another kind"
-            )
         height, width, _ = reference.shape
         self._size = height, width
         self._pattern = Pattern(self.rest.centre_px, size=self._size)

@@ -213,18 +213,6 @@ def fill_head(model: nn.Module, weights: Mapping[str, Tensor]) -> nn.Module:
     return model
 
 
-REFERENCE_SIGNS = {"raw": 0.0, "difference": -1.0, "amplitude": -1.0}
-"""Initial ratio of the reference half of a `pair` network's first layer to its frame half, by the input of the network
-it starts from: 0 leaves the predictions of a raw network the same, -1 makes T_n - T_0, which is |T_n - T_0| but for the
-sign."""
-
-
-def with_reference(weights: Mapping[str, Tensor], *, sign: float) -> dict[str, Tensor]:
-    """Make weights of a network with the reference beside the frame from weights of a network without."""
-    first = next(name for name, value in weights.items() if value.ndim == 4)
-    return {**weights, first: torch.cat([weights[first], sign * weights[first]], dim=1)}
-
-
 DEFAULT_BACKBONE = "shufflenet_v2_x1_0"
 BACKBONES: dict[str, Callable[..., nn.Module]] = {
     name: _classifiers.get_model_builder(name) for name in _classifiers.list_models(_classifiers)

@@ -40,13 +40,18 @@ class OneOutput(nn.Module):
             values = values[:, self.output] if isinstance(self.output, int) and values.ndim > 1 else values
         elif self.output is not None or (isinstance(values, tuple | list) and len(values) == 1):
             values = values[self.output or 0]  # pyright: ignore[reportCallIssue, reportArgumentType] (its own key)
-        if not isinstance(values, Tensor) or tuple(values.shape) not in {(len(images),), (len(images), 1)}:
-            what = f"shape {tuple(values.shape)}" if isinstance(values, Tensor) else f"type {type(values).__name__}"
-            raise ModelError(
-                f"the module's output has {what} for {len(images)} images; choose one number an image with output=, "
-                "such as output=0"
-            )
-        return values.reshape(len(images))
+        return one_output(values, len(images))
+
+
+def one_output(output: object, images: int) -> Float[Tensor, " batch"]:
+    """Return the output of a module as one number an image; `ModelError` if it is anything else."""
+    if not isinstance(output, Tensor) or tuple(output.shape) not in {(images,), (images, 1)}:
+        what = f"shape {tuple(output.shape)}" if isinstance(output, Tensor) else f"type {type(output).__name__}"
+        raise ModelError(
+            f"the model's output has {what} for {images} image(s), not one number an image; end it with one output, "
+            "such as Linear(features, 1), or choose one with sliplens.wrap(model, output=0)"
+        )
+    return output.reshape(images)
 
 
 def wrap(

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sliplens.errors import ContactError
 from sliplens.mechanics import (
     contact_radius,
     hertz_displacement,
@@ -190,8 +189,6 @@ def load_grasp(
     `varied` pull is drawn (`draw_pull`) and the trial lasts as long as that takes; else the margin falls evenly, in a
     trial of 8 s.
     """
-    if frames < MINIMUM_FRAMES:
-        raise ContactError(f"a trial of {frames} frames cannot hold all phases; ask for {MINIMUM_FRAMES} or more")
     trial_s, (touch, pressed, pull, slip, let_go, gone) = _phase_ends(frames, rng, release=release, varied=varied)
     index = np.arange(frames)
     progress = index / (frames - 1)
@@ -243,8 +240,6 @@ def load_at_states(
 
     A margin of 0 slips, one of NaN is no contact; `held_s` is the time since the touch, with which creep grows.
     """
-    if np.any((margins < 0) | (margins > 1)):
-        raise ContactError("safety margins must lie in [0, 1]; give them as fractions, not in percent")
     nothing = np.zeros(len(margins))
     used = 1 - np.nan_to_num(margins, nan=1.0)
     states = ContactFriction(coefficient=friction, used=used, carried=nothing, slips=margins == 0)
@@ -364,10 +359,6 @@ def move_markers(sensor: Sensor, grasp: Grasp, *, loading: Loading, displacement
     `displacement`: a row of `DISPLACEMENTS`; the sensor's default if None.
     """
     name = sensor.displacements[0] if displacement is None else displacement
-    if name not in sensor.displacements:
-        raise ContactError(
-            f"sensor {sensor.name} cannot be moved by {name!r}; choose {' or '.join(sensor.displacements)}"
-        )
     model = DISPLACEMENTS[name]
     modulus_pa = sensor.youngs_modulus_pa
     if name == "calibrated" and sensor.effective_modulus_pa is not None:

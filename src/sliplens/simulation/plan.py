@@ -279,11 +279,6 @@ def _with_totals(plans: Sequence[TrialPlan], totals: dict[str, int]) -> tuple[Tr
     lengths: dict[str, int] = {}
     for split, total in totals.items():
         chosen = [plan for plan in plans if plan.split == split]
-        if total < MINIMUM_FRAMES * len(chosen) or not chosen:
-            raise InputError(
-                f"{total} frames cannot fill {len(chosen)} {split} trials of at least {MINIMUM_FRAMES}; "
-                "change the frame totals or the trials"
-            )
         # drawn from each trial's seed, so that other trials hardly change its share
         shares = np.array([np.random.default_rng((plan.seed, 0)).uniform(0.9, 1.1) for plan in chosen])
         ends = np.round(np.cumsum(shares) / shares.sum() * total).astype(int)

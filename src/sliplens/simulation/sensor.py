@@ -13,9 +13,6 @@ import torch
 from jaxtyping import Float, Float32, Int
 from torch import Tensor
 
-from sliplens.errors import ContactError
-from sliplens.mechanics import reduced_modulus
-
 Frames: TypeAlias = Float[np.ndarray, " frames"]
 Point: TypeAlias = Float[np.ndarray, "2"]
 Rays: TypeAlias = Float[np.ndarray, "height width 2"]
@@ -32,13 +29,6 @@ def _squared_distance(rays: Rays, *, height: Frames, centre: Point) -> Maps:
     square += np.float32(centre @ centre)
     # rounding may leave a little less than nothing at the centre
     return np.maximum(square, 0, out=square)
-
-
-def require_positive(**values: float | int) -> None:
-    """Check the lengths and counts of a shape, named in words."""
-    for name, value in values.items():
-        if not value > 0:
-            raise ContactError(f"{name.replace('_', ' ')} must be positive, got {value:.3g}; check the sensor's sheet")
 
 
 def pixel_grid(size_px: int) -> Float[np.ndarray, "size size 2"]:
@@ -66,26 +56,6 @@ class Dome:
     ring_scale: tuple[float, ...]
     """Marker size by ring."""
 
-    def __post_init__(self) -> None:
-        require_positive(
-            dome_radius=self.radius_m, focal_length=self.focal_px_per_rad, ring_spacing=self.ring_spacing_deg
-        )
-        if not -1 < self.camera_offset < 1:
-            raise ContactError(
-                f"the camera lies {self.camera_offset:.3g} dome radii behind the centre, outside the dome; "
-                "give an offset between -1 and 1"
-            )
-        if len(self.ring_scale) != len(self.ring_counts):
-            raise ContactError(
-                f"the dome has {len(self.ring_counts)} rings but {len(self.ring_scale)} marker sizes; give one a ring"
-            )
-        outermost = (len(self.ring_counts) - 1) * self.ring_spacing_deg
-        if outermost > 90:
-            raise ContactError(
-                f"the outermost ring would lie {outermost:.4g} degrees from the apex, outside the dome, which ends at "
-                "90; use fewer rings or space them closer"
-            )
-
     @property
     def sphere_radius_m(self) -> float:
         """Radius of the dome."""
@@ -102,11 +72,6 @@ class Dome:
 
     def marker_positions(self, depth_m: float = 0.0) -> Float[np.ndarray, "markers 3"]:
         """Places of the markers under the skin of the untouched dome, in metres."""
-        if not 0 <= depth_m < self.radius_m:
-            raise ContactError(
-                f"markers {depth_m:.3g} m under the skin lie outside a dome of radius {self.radius_m:.3g} m; "
-                "give a depth from 0 to less than the radius"
-            )
         theta = np.repeat(np.arange(len(self.ring_counts)) * math.radians(self.ring_spacing_deg), self.ring_counts)
         # rows run down, so straight up is -90 degrees
         phi = np.concatenate([2 * math.pi * np.arange(count) / count - math.pi / 2 for count in self.ring_counts])
@@ -168,11 +133,6 @@ class FlatPad:
     columns: int
     rows: int
 
-    def __post_init__(self) -> None:
-        require_positive(ball_radius=self.ball_radius_m, camera_distance=self.camera_distance_m)
-        require_positive(focal_length=self.focal_px, dot_spacing=self.spacing_m)
-        require_positive(number_of_columns=self.columns, number_of_rows=self.rows)
-
     @property
     def sphere_radius_m(self) -> float:
         """Radius of the ball."""
@@ -189,11 +149,6 @@ class FlatPad:
 
     def marker_positions(self, depth_m: float = 0.0) -> Float[np.ndarray, "markers 3"]:
         """Places of the dots in the untouched gel, in metres."""
-        if not 0 <= depth_m < self.camera_distance_m:
-            raise ContactError(
-                f"dots {depth_m:.3g} m under the skin do not lie between it and the camera at "
-                f"{self.camera_distance_m:.3g} m; give a depth from 0 to less than that"
-            )
         x = (np.arange(self.columns) - (self.columns - 1) / 2) * self.spacing_m
         y = (np.arange(self.rows) - (self.rows - 1) / 2) * self.spacing_m
         across, down = np.meshgrid(x, y)
@@ -314,11 +269,6 @@ class MarkerLook:
     pressed_fade: Rgb = _NONE
     """Share of its contrast that a marker loses in a nominal contact."""
 
-    def __post_init__(self) -> None:
-        for name, values in (("marker radius", self.radius_px), ("marker edge", self.edge_px)):
-            for channel, value in zip(("red", "green", "blue"), values, strict=True):
-                require_positive(**{f"{name} in {channel}": value})
-
 
 @dataclass(frozen=True, kw_only=True)
 class Light:
@@ -354,8 +304,7 @@ class Glare:
 class Sensor:
     """A fingertip: its shape and camera, its gel, and how it looks.
 
-    Colours are grey levels (0 to 255) in the order of the image file. A modulus or an image size that is not positive,
-    or a Poisson's ratio outside [0, 0.5], is a `ContactError`.
+    Colours are grey levels (0 to 255) in the order of the image file.
     """
 
     name: str
@@ -378,15 +327,6 @@ class Sensor:
     sees_contact: bool = True
     """True where the object shines through the skin: a veil, a glow and the skin's grain in contact."""
     noise: Noise
-
-    def __post_init__(self) -> None:
-        try:
-            reduced_modulus(youngs_modulus_pa=self.youngs_modulus_pa, poisson_ratio=self.poisson_ratio)
-            require_positive(image_size=self.image_size_px)
-            if self.effective_modulus_pa is not None:
-                require_positive(effective_modulus=self.effective_modulus_pa)
-        except ContactError as error:
-            raise ContactError(f"sensor {self.name}: {error}") from None
 
     @property
     def displacements(self) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 import weakref
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Unpack
 
@@ -171,16 +171,7 @@ def visible_markers(sensor: Sensor) -> Int[np.ndarray, " markers"]:
 _ROUNDING = 1  # grey levels by which another device or library may draw the same scene differently
 
 
-@dataclass(frozen=True, kw_only=True)
-class FilmedTrial:
-    """A simulated trial with its plan, loading and film."""
-
-    plan: TrialPlan
-    loading: Loading
-    film: Film
-
-
-def rebuild_trial(folder: Path, recording: Recording, *, recipe: SimulationRecipe | None = None) -> FilmedTrial:
+def rebuild_trial(folder: Path, recording: Recording, *, recipe: SimulationRecipe | None = None) -> Film:
     """Prepare a stored simulated trial to be drawn again with the same bytes; its recipe is read if None."""
     name, truth = recording.trial, recording.truth
     if truth is None:
@@ -192,7 +183,7 @@ def rebuild_trial(folder: Path, recording: Recording, *, recipe: SimulationRecip
             f"trial {name} of {folder} was simulated by another recipe, or by another version of sliplens than this "
             f"{__version__}; simulate the data set again"
         )
-    loading, film = prepare_trial(plans[name])
+    _, film = prepare_trial(plans[name])
     # the untouched sensor shows light, camera and print; the last frame depends on all the rest
     last = len(film) - 1
     drawn = torch.stack([film.draw_reference(), film.draw(slice(last, last + 1))[0]]).numpy().astype(np.int16)
@@ -201,7 +192,7 @@ def rebuild_trial(folder: Path, recording: Recording, *, recipe: SimulationRecip
             f"trial {name} of {folder} is drawn differently from its stored frames: they were changed, or other "
             "versions of numpy and torch made them; simulate the data set again"
         )
-    return FilmedTrial(plan=plans[name], loading=loading, film=film)
+    return film
 
 
 def put_markers_back(

@@ -75,7 +75,7 @@ def prove_map(
     the record; None where the trial cannot be drawn again, or the map nowhere supports the change of the prediction.
     """
     try:
-        film = rebuild_trial(folder, recording).film
+        film = rebuild_trial(folder, recording)
     except InputError:
         return None
     visible = visible_markers(film.sensor)

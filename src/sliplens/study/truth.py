@@ -27,7 +27,8 @@ from sliplens.results.explanation import ExplainedFrame, Explanation
 from sliplens.results.faithfulness import CHANCE, RemovalCurve, is_control
 from sliplens.results.study import Localisation, MarkerEffects, MetaTest, NeutralScores, Truth
 from sliplens.runner import Part, part
-from sliplens.simulation.trials import FilmedTrial, put_markers_back, rebuild_trial, visible_markers
+from sliplens.simulation.filming import Film
+from sliplens.simulation.trials import put_markers_back, rebuild_trial, visible_markers
 from sliplens.study.neutral import (
     GROUPS,
     correlate_groups,
@@ -51,7 +52,7 @@ class StagedFrame:
     safety_margin: float
     neutral_frame: int
     """Frame to whose places groups of markers are moved."""
-    scene: FilmedTrial
+    film: Film
     reference: UInt8[np.ndarray, "rows columns 3"]
     markers: Int[np.ndarray, " markers"]
     """Numbers of the markers that lie wholly in the image: those cut by its border stay as they are."""
@@ -78,19 +79,19 @@ def stage_frames(trained: Network, explained: Explanation, data: Dataset) -> tup
     staged: dict[int, StagedFrame] = {}
     for trial, rows in explained.trials.items():
         recording = data.load(data.find(trial))
-        scene = rebuild_trial(data.folder, recording)
+        film = rebuild_trial(data.folder, recording)
         for row in rows:
-            staged[row] = _stage(explained.frames[row], scene, recording, size=trained.manifest.image_size)
+            staged[row] = _stage(explained.frames[row], film, recording, size=trained.manifest.image_size)
     return tuple(staged[row] for row in range(len(explained.frames)))
 
 
-def _stage(explained: ExplainedFrame, scene: FilmedTrial, recording: Recording, *, size: int) -> StagedFrame:
+def _stage(explained: ExplainedFrame, film: Film, recording: Recording, *, size: int) -> StagedFrame:
     assert recording.truth is not None  # a trial that was rebuilt has its truth
     number = int(explained.id.removeprefix(f"{recording.trial}-f"))
-    contact_map, markers = recording.truth.contact_map[number], visible_markers(scene.film.sensor)
+    contact_map, markers = recording.truth.contact_map[number], visible_markers(film.sensor)
     height, width = contact_map.shape
     scale, steps = size / width, np.arange(size)
-    centres_px, radius_px = scene.film.outlines(number)
+    centres_px, radius_px = film.outlines(number)
 
     def from_outline(centres_px: np.ndarray, radius_px: np.ndarray) -> Float[np.ndarray, "circles size size"]:
         # pixel centres lie at whole numbers, edges half a pixel before
@@ -98,7 +99,7 @@ def _stage(explained: ExplainedFrame, scene: FilmedTrial, recording: Recording, 
         away = np.hypot(steps[None, None, :] - centres[:, :1, None], steps[None, :, None] - centres[:, 1:, None])
         return away - radius_px[:, None, None] * scale
 
-    rest, now = from_outline(*scene.film.outlines(explained.baseline_frame)), from_outline(centres_px, radius_px)
+    rest, now = from_outline(*film.outlines(explained.baseline_frame)), from_outline(centres_px, radius_px)
     beyond = np.minimum(rest, now)
     place = np.full(len(centres_px), len(markers))
     place[markers] = np.arange(len(markers))
@@ -109,7 +110,7 @@ def _stage(explained: ExplainedFrame, scene: FilmedTrial, recording: Recording, 
         number=number,
         safety_margin=float(recording.safety_margin[number]),
         neutral_frame=neutral_frame(recording.safety_margin, number),
-        scene=scene,
+        film=film,
         reference=recording.reference,
         markers=markers,
         regions=marker_regions((size, size), torch.from_numpy((now_px + 0.5) * scale - 0.5)).numpy(),
@@ -128,7 +129,7 @@ def redrawing(trained: Network, frames: Sequence[StagedFrame], *, to: Sequence[i
 
     def redraw(image: int, back: Bool[np.ndarray, "variants markers"]) -> Float[Tensor, "variants colours size size"]:
         frame = frames[image]
-        film = frame.scene.film
+        film = frame.film
         every = np.zeros((len(back), len(film.marker_rest_px)), dtype=bool)
         every[:, frame.markers] = back
         drawn = put_markers_back(film, frame.number, every, to=to[image] if to else None).draw_all()

@@ -23,12 +23,10 @@ from sliplens.files import output_folder, scratch_folder, versions
 from sliplens.images import has_colour
 from sliplens.models import Manifest, Network, build_model, load, save_checkpoint
 from sliplens.models.backbones import (
-    REFERENCE_SIGNS,
     HistogramRegressor,
     bin_edges,
     fill_head,
     last_layer,
-    with_reference,
 )
 from sliplens.models.calibration import Calibration, Traction, calibrate_histogram, conformal_calibration
 from sliplens.models.checkpoint import Estimate, Ratio, sensor_kind
@@ -50,7 +48,6 @@ from sliplens.training.data import (
     load_frames,
 )
 from sliplens.training.module import (
-    DivergedError,
     Patience,
     Regressor,
     describe_training,
@@ -393,52 +390,41 @@ def fit(
     loader = partial(DataLoader, batch_size=config.batch_size, collate_fn=lambda batch: batch)
     loaders = loader(frames[0], sampler=shuffle, drop_last=True), loader(frames[1])
 
-    def save_best() -> float:
-        """Calibrate and save the network of the best epoch; return its validation error."""
-        # our own file of tensors and plain numbers, read back without unpickling anything else
-        checkpoint = torch.load(best.best_model_path, map_location="cpu", weights_only=True)
-        module.load_state_dict(checkpoint["state_dict"])
-        calibration, traction = calibrate(
-            network,
-            frames[1],
-            batch_size=config.batch_size,
-            trained_friction=train.friction,
-            margin_calibration=learnt and learnt.calibration,
-        )
-        if network is not model:  # the last layer and the temperatures were fitted by themselves
-            model.load_state_dict(network.state_dict(), strict=False)
-            last_layer(model).load_state_dict(last_layer(network).state_dict())
-        model.eval()
-        samples = (some.sample(_NOVELTY_FRAMES, batch_size=config.batch_size) for some in (train, validation))
-        complete = replace(
-            manifest,
-            trained_on=(*manifest.trained_on, *(start.manifest.trained_on if start else ())),
-            started_from=start.manifest.weights_sha256 if start else "",
-            versions=versions(),
-            metrics={"validation_mse": calibration.mse},
-            calibration=calibration,
-            traction=traction,
-            # where the last layer alone was trained, the early layers stay as they were
-            novelty=learnt.novelty if learnt else fit_novelty(model, *samples),
-        )
-        save_checkpoint(folder, model, complete)
-        # as the file itself has it: after a crash between two files the callback may remember an older one
-        return float(checkpoint["callbacks"][best.state_key]["current_score"])
-
-    try:
-        with torch.random.fork_rng(devices=[]), open_stage(f"Training ({train.encoding.name})"):
-            run_trainer(trainer, module, loaders, checkpoints / "last.ckpt")
-    except DivergedError as error:
-        if not best.best_model_path:
-            raise
-        raise ModelError(
-            f"{error} (the best network so far, of validation MSE {save_best():.4g}, is in {folder})"
-        ) from None
+    with torch.random.fork_rng(devices=[]), open_stage(f"Training ({train.encoding.name})"):
+        run_trainer(trainer, module, loaders, checkpoints / "last.ckpt")
+    # our own file of tensors and plain numbers, read back without unpickling anything else
+    checkpoint = torch.load(best.best_model_path, map_location="cpu", weights_only=True)
+    module.load_state_dict(checkpoint["state_dict"])
+    calibration, traction = calibrate(
+        network,
+        frames[1],
+        batch_size=config.batch_size,
+        trained_friction=train.friction,
+        margin_calibration=learnt and learnt.calibration,
+    )
+    if network is not model:  # the last layer and the temperatures were fitted by themselves
+        model.load_state_dict(network.state_dict(), strict=False)
+        last_layer(model).load_state_dict(last_layer(network).state_dict())
+    model.eval()
+    samples = (some.sample(_NOVELTY_FRAMES, batch_size=config.batch_size) for some in (train, validation))
+    complete = replace(
+        manifest,
+        trained_on=(*manifest.trained_on, *(start.manifest.trained_on if start else ())),
+        started_from=start.manifest.weights_sha256 if start else "",
+        versions=versions(),
+        metrics={"validation_mse": calibration.mse},
+        calibration=calibration,
+        traction=traction,
+        # where the last layer alone was trained, the early layers stay as they were
+        novelty=learnt.novelty if learnt else fit_novelty(model, *samples),
+    )
+    save_checkpoint(folder, model, complete)
     late = config.max_minutes is not None and module.step < module.steps
     training = replace(
         describe_training(manifest, config, module.rows, frames=(len(train), len(validation)), trained=model),
         stopped_by="no gain" if early and early[0].stopped_epoch else "time limit" if late else "epochs",
-        best_validation_mse=save_best(),
+        # as the file itself has it: after a crash between two files the callback may remember an older one
+        best_validation_mse=float(checkpoint["callbacks"][best.state_key]["current_score"]),
     )
     shutil.rmtree(checkpoints)
     return training
@@ -466,11 +452,8 @@ def _begin(config: TrainingConfig, encoding: Encoding, start: Network | None) ->
     model = model.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     if start is not None:
         require_same_kind(start, config, encoding.name)
-        weights = start.model.state_dict()
-        if encoding.colours > start.encoding.colours:
-            weights = with_reference(weights, sign=REFERENCE_SIGNS[start.manifest.input])
         fill = model.load_state_dict if start.manifest.head == config.head else partial(fill_head, model)
-        fill(weights)
+        fill(start.model.state_dict())
     return model
 
 
@@ -491,11 +474,9 @@ def require_same_kind(start: Network, config: TrainingConfig, encoding: str) -> 
     """Refuse to start from a network whose weights would mean something else."""
     for name, value in (("input", encoding), ("backbone", config.backbone), ("head", config.head)):
         existing = getattr(start.manifest, name)
-        # a second answer can be learnt beside the first or left out, and the reference be seen beside the frame; not
-        # by a last layer alone: the first answer would stay as it was for other images
-        paired = value == "pair" and existing in REFERENCE_SIGNS and config.learns not in _KEEP_PREDICTIONS
+        # a second answer can be learnt beside the first or left out
         changed = {existing, value} == {"histogram", "margin-and-ratio"}
-        if existing != value and not (paired or changed):
+        if existing != value and not changed:
             raise ModelError(
                 f"the network to start from has the {name} {existing}, and {value} is to be trained; "
                 f"train {existing}, or start from another network"

@@ -32,10 +32,6 @@ from sliplens.training.config import TrainingConfig
 from sliplens.training.data import Augmentation
 
 
-class DivergedError(ModelError):
-    """A loss or an error is no longer finite."""
-
-
 class Regressor(lightning.LightningModule):
     """Network with its loss, its augmentation, its optimizer and its learning curve, which is written after each epoch.
 
@@ -111,7 +107,7 @@ class Regressor(lightning.LightningModule):
             images = self.augmentation(images, generator=generator)
         loss, margins = margin_loss(self.model, images, labels, ratios)
         if not torch.isfinite(loss):
-            raise DivergedError(
+            raise ModelError(
                 f"the training loss is {loss.item()} in epoch {self.current_epoch + 1}, at step {self.global_step}; "
                 "lower the learning rate and try again"
             )
@@ -156,10 +152,10 @@ class Regressor(lightning.LightningModule):
 def add_row(rows: list[list[float]], row: list[float], file: Path) -> None:
     """Add epoch, training MSE, validation MSE and minutes to a learning curve, and write all of it to a CSV file.
 
-    `DivergedError` if the validation error is not finite.
+    `ModelError` if the validation error is not finite.
     """
     if not math.isfinite(row[2]):
-        raise DivergedError(
+        raise ModelError(
             f"the validation error is {row[2]} after epoch {len(rows) + 1}; lower the learning rate and try again"
         )
     rows.append(row)

@@ -50,11 +50,6 @@ class TrialOutputs:
         """Return some frames."""
         return TrialOutputs(**{name: values[rows] for name, values in vars(self).items()})
 
-    def before_gap(self) -> "TrialOutputs":
-        """Return the frames before the first gap; the frames after it keep the predictions of single frames."""
-        gaps = np.flatnonzero(np.diff(self.time_s) > GAP_S + ROUNDING_S)
-        return self.at(slice(gaps[0] + 1 if len(gaps) else None))
-
     def steps(self, step_s: float = STEP_S, *, late_s: float = 0.0) -> "TrialOutputs":
         """Return the frames at which memory takes its steps; the first step is `late_s` after the beginning.
 
@@ -150,7 +145,9 @@ def _predict_trials(network: Network, data: Dataset, trials: Sequence[TrialInfo]
                 label=recording.safety_margin[rows],
                 time_s=recording.time_s[rows],
             )
-            outputs.append(trial.before_gap())
+            # frames after the first gap keep the predictions of single frames
+            gaps = np.flatnonzero(np.diff(trial.time_s) > GAP_S + ROUNDING_S)
+            outputs.append(trial.at(slice(gaps[0] + 1 if len(gaps) else None)))
     if not outputs:
         raise RecordingError(f"{data.folder}: no frame of the {name} trials has a label; label them first")
     return outputs
