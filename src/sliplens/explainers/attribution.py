@@ -39,21 +39,6 @@ def spread(maps: Float[Tensor, "*maps rows columns"], size: tuple[int, int]) -> 
     return resize(maps / (rows[:, None] * columns), size)
 
 
-def percentile_bounds(
-    maps: Float[Tensor, "*maps rows columns"],
-) -> tuple[Float[Tensor, "*maps"], Float[Tensor, "*maps"]]:
-    """0.1th and 99.9th percentile of each map, linear between ranks as `numpy.quantile`."""
-    ordered = maps.flatten(-2).sort(dim=-1).values
-
-    def at(share: float) -> Tensor:
-        # a Python float: `torch.quantile` rounds the rank to the map's type, which in float32 moves the percentile
-        rank = share * (ordered.shape[-1] - 1)
-        below = int(rank)
-        return torch.lerp(ordered[..., below], ordered[..., min(below + 1, ordered.shape[-1] - 1)], rank - below)
-
-    return at(0.001), at(0.999)
-
-
 def to_masks(
     maps: Float[Tensor, "*maps rows columns"], *, as_published: bool = False
 ) -> Float[Tensor, "*maps rows columns"]:
@@ -64,7 +49,16 @@ def to_masks(
     Englebert, Cornu and De Vleeschouwer, *Poly-CAM: High resolution class activation map for convolutional neural
     networks*, ICPR 2022, and its public code for the division by hi rather than by the range.
     """
-    low, high = (bound[..., None, None] for bound in percentile_bounds(maps))
+    ordered = maps.flatten(-2).sort(dim=-1).values
+
+    def percentile(share: float) -> Tensor:
+        # a Python float: `torch.quantile` rounds the rank to the map's type, which in float32 moves the percentile
+        rank = share * (ordered.shape[-1] - 1)
+        below = int(rank)
+        value = torch.lerp(ordered[..., below], ordered[..., min(below + 1, ordered.shape[-1] - 1)], rank - below)
+        return value[..., None, None]
+
+    low, high = percentile(0.001), percentile(0.999)
     masks = ((maps - low) / high.clamp_min(FLOOR)).clamp(0, 1)
     return masks if as_published else torch.where(high < 0, torch.zeros_like(masks), masks)
 

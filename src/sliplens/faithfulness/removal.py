@@ -113,18 +113,14 @@ def _paint(
     paint: Painter, orders: np.ndarray, jobs: Sequence[tuple[int, int, int]], *, images: Tensor, batch_size: int
 ) -> Iterator[Tensor]:
     """Yield images of which parts are gone, a batch at a time; jobs are image, order and pixels removed."""
-    ranked, rank = None, torch.empty(0)
+    size = images.shape[-2:]
     for start in range(0, len(jobs), batch_size):
         batch = jobs[start : start + batch_size]
-        gone = torch.empty((len(batch), *images.shape[-2:]), dtype=torch.bool)
+        gone = torch.zeros((len(batch), size.numel()), dtype=torch.bool)
         for row, (image, order, pixels) in enumerate(batch):
-            if ranked != (image, order):  # jobs that share one stand together, so that it is ranked once
-                ranked, rank = (image, order), torch.empty(orders.shape[-1], dtype=torch.int32)
-                rank[torch.from_numpy(orders[order, image])] = torch.arange(len(rank), dtype=torch.int32)
-                rank = rank.view(gone.shape[1:])
-            gone[row] = rank < pixels
+            gone[row, torch.from_numpy(orders[order, image, :pixels])] = True
         rows = torch.tensor([image for image, _, _ in batch], device=images.device)
-        yield paint(rows, gone.to(images.device))
+        yield paint(rows, gone.view(-1, *size).to(images.device))
 
 
 def removal_curves(

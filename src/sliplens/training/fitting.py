@@ -1,7 +1,7 @@
 """Training: fit a network to a data set."""
 
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -188,8 +188,10 @@ def train(
         return replace(training, condition=condition)
 
     with reporting(on_progress):
-        for sentence in _advise(config, start):
-            add_note(sentence)
+        if start is not None and start.manifest.head == "margin-and-ratio" and config.head == "histogram":
+            add_note("the labels have no forces and friction, so the network learns the margin alone: no --friction")
+        elif start is not None and start.sequence is not None and config.learns != "sequence":
+            add_note("the head for several frames of --start-from is left out; train another by --recipe sequence")
         if out is None:
             with scratch_folder() as folder:
                 training = run(folder)
@@ -231,8 +233,6 @@ def _choose_trials(data: Dataset, condition: str | None) -> tuple[tuple[TrialInf
     except RecordingError as error:
         cure = "divide it" if condition is None else "name another --condition, or divide it"
         raise RecordingError(f"{error}; {cure} with `sliplens split`") from None
-    if len({(info.height, info.width) for info in (*train, *validation)}) > 1:
-        raise RecordingError(f"{data.folder} mixes frames of several sizes; train on one sensor at a time")
     labels = [data.read_labels(info) for info in train]
     margins = np.concatenate([some.safety_margin[some.labelled] for some in labels])
     # rounding of margins that were computed from constant forces
@@ -274,14 +274,6 @@ def pull_direction(trial: Recording) -> float | None:
         return None
     mean = Shear(**{name: float(np.mean([shear[name] for shear in shears])) for name in shears[0]})
     return mean.direction_deg if np.hypot(mean.x_px, mean.y_px) > _SURE * mean.sigma_px else None
-
-
-def _advise(config: TrainingConfig, start: Network | None) -> Iterator[str]:
-    """Name abilities of the network to start from that will be lost."""
-    if start is not None and start.manifest.head == "margin-and-ratio" and config.head == "histogram":
-        yield "the labels have no forces and friction, so the network learns the margin alone: it takes no --friction"
-    elif start is not None and start.sequence is not None and config.learns != "sequence":
-        yield "the head for several frames of the network to start from is left out; train another by --recipe sequence"
 
 
 @torch.no_grad()
