@@ -162,8 +162,13 @@ def frames_from_arrays(
     if not isinstance(baseline, str):
         network.require_frame_size(baseline.shape[:2], what="the baseline's frame")
         references, name = small(baseline[None]), "given"
-    elif baseline in {"black", "mean", "blurred"}:
-        references, name = small(_hide(frames, baseline)), baseline
+    elif baseline == "blurred":
+        sigma = _BLUR_SHARE * frames.shape[1]
+        blurred = gaussian_filter(frames.astype(np.float32), (0, sigma, sigma, 0))
+        references, name = small(np.round(blurred).astype(np.uint8)), baseline
+    elif baseline in {"black", "mean"}:
+        colour = frames.mean(axis=(0, 1, 2)).round() if baseline == "mean" else 0
+        references, name = small(np.broadcast_to(np.asarray(colour, np.uint8), frames.shape)), baseline
     else:
         if baseline == "stick":
             stick, warnings = try_stick_frame("frames", frames, reference)
@@ -191,15 +196,6 @@ def frames_from_arrays(
         baseline_frame=(stick,) * len(frames),
         warnings=warnings,
     )
-
-
-def _hide(frames: UInt8[np.ndarray, "batch height width 3"], how: str) -> UInt8[np.ndarray, "batch height width 3"]:
-    """Return images that show nothing of the frames: black, their mean colour, or each frame blurred."""
-    if how == "blurred":
-        sigma = _BLUR_SHARE * frames.shape[1]
-        return np.round(gaussian_filter(frames.astype(np.float32), (0, sigma, sigma, 0))).astype(np.uint8)
-    colour = frames.mean(axis=(0, 1, 2)).round() if how == "mean" else 0
-    return np.broadcast_to(np.asarray(colour, np.uint8), frames.shape)
 
 
 def frames_from_dataset(

@@ -231,7 +231,11 @@ def predict(
         if profile is None and isinstance(data, Dataset):
             profile = data.profile(data.trials[0].sensor)
         if network is None:
-            name, origin = _choose_network(trials.kinds, profile)
+            name, origin = DEFAULT_NETWORK, "which comes with sliplens"
+            if profile is not None and profile.network is not None:
+                name, origin = profile.network, f"which the profile {profile.name} names"
+            elif any(kind.read_reference is None and not _is_recorded(kind) for kind in trials.kinds):
+                name, origin = DIFFERENCE_NETWORK, "which comes with sliplens for difference images"
             add_note(f"no network was named, so {name} reads it, {origin}")
             network = open_run(name, device=device)
         kinds = [_assume_reference(network, capture) for capture in trials.kinds]
@@ -290,15 +294,6 @@ def _list_notes(
     if sequence:
         notes.append("Frames were read in order: each answer counts those of its contact before it.")
     return tuple(dict.fromkeys(notes))
-
-
-def _choose_network(kinds: Sequence[Capture], profile: SensorProfile | None) -> tuple[str, str]:
-    """Choose a network for a source, and say where the choice comes from."""
-    if profile is not None and profile.network is not None:
-        return profile.network, f"which the profile {profile.name} names"
-    if any(capture.read_reference is None and not _is_recorded(capture) for capture in kinds):
-        return DIFFERENCE_NETWORK, "which comes with sliplens for difference images"
-    return DEFAULT_NETWORK, "which comes with sliplens"
 
 
 def _assume_reference(network: Network, trial: Capture) -> Capture:

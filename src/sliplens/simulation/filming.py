@@ -334,18 +334,14 @@ def haze(sensor: Sensor, *, grasp: Grasp, contact_px: Point, radius_px: float, r
         return np.zeros((3, sensor.image_size_px, sensor.image_size_px), dtype=np.float32)
     square = ((pixel_grid(sensor.image_size_px) - contact_px) ** 2).sum(axis=-1)
     disc = np.exp(-((square / (_GLOW_RADIUS * radius_px) ** 2) ** 2))
-    grain = grasp.skin_grain * _smooth_noise(sensor.image_size_px, rng=rng)
-    return _planes(np.asarray(grasp.veil) + disc[..., None] * np.asarray(grasp.glow) + grain[..., None])
-
-
-def _smooth_noise(size: int, *, rng: np.random.Generator) -> Float[np.ndarray, "size size"]:
-    """Draw noise of unit variance, correlated over a few pixels."""
-    steps = np.arange(-8, 9)
+    # noise of unit variance, correlated over a few pixels
+    steps, size = np.arange(-8, 9), sensor.image_size_px + 16
     kernel = np.exp(-(steps**2) / (2 * _GRAIN_PX**2))
     kernel /= np.linalg.norm(kernel)
     windows = np.lib.stride_tricks.sliding_window_view
-    rows = windows(rng.standard_normal((size + 16, size + 16)), len(kernel), axis=1) @ kernel
-    return windows(rows, len(kernel), axis=0) @ kernel
+    rows = windows(rng.standard_normal((size, size)), len(kernel), axis=1) @ kernel
+    grain = grasp.skin_grain * (windows(rows, len(kernel), axis=0) @ kernel)
+    return _planes(np.asarray(grasp.veil) + disc[..., None] * np.asarray(grasp.glow) + grain[..., None])
 
 
 def _planes(image: Float[np.ndarray, "height width 3"]) -> Planes:
