@@ -124,7 +124,7 @@ def test_the_published_map_does_not_depend_on_the_reference(network, images, ref
     model = network("shufflenet")
     published = GradCam(published=True)
     one, other = published(model, images), published(model, images, reference=reference)
-    torch.testing.assert_close(one.saliency, other.saliency, atol=1e-6, rtol=1e-6)
+    torch.testing.assert_close(one.influence, other.influence, atol=1e-6, rtol=1e-6)
     assert not torch.equal(one.reference_prediction, other.reference_prediction)
     assert one.completeness_gap is None
 

@@ -89,7 +89,7 @@ def test_the_error_that_is_told_is_not_smaller_than_the_error(network, images):
     rough = PolyCam(budget=0.4, likeness=None)(model, images)
     for index, told in enumerate(rough.approximations):
         assert told.measured == math.ceil(0.4 * told.channels)
-        truth = exact.saliency[index], rough.saliency[index]
+        truth = exact.influence[index], rough.influence[index]
         # the mean of 16 maps that may be, against the one that is: their spread is of the size of their error
         assert pearson_r(*truth) >= told.pearson_r - (1 - told.pearson_r)
         assert top_overlap(*truth) >= told.top_overlap - (1 - told.top_overlap)
@@ -102,7 +102,7 @@ def test_the_thesis_score_has_a_budget_too(network, images):
     exact = PolyCam(published=True)(model, images)
     near = PolyCam(published=True, budget=0.5, likeness=(0.95, 0.9))(model, images)
     for index in range(len(images)):
-        assert pearson_r(exact.saliency[index], near.saliency[index]) >= 0.95
+        assert pearson_r(exact.influence[index], near.influence[index]) >= 0.95
 
 
 def test_more_is_measured_where_the_map_is_not_expected_to_be_alike(network, images):
@@ -116,8 +116,8 @@ def test_more_is_measured_where_the_map_is_not_expected_to_be_alike(network, ima
         enough = [1 - one.pearson_r <= 0.05 and 1 - one.top_overlap <= 0.2 for one in (first, last)]
         assert enough[1]
         assert (last.measured > first.measured) == (not enough[0])
-        assert pearson_r(exact.saliency[index], further.saliency[index]) >= 0.9
-        assert top_overlap(exact.saliency[index], further.saliency[index]) >= 0.6
+        assert pearson_r(exact.influence[index], further.influence[index]) >= 0.9
+        assert top_overlap(exact.influence[index], further.influence[index]) >= 0.6
         more.append(not enough[0])
         if enough[0]:
             torch.testing.assert_close(further.relevance[index], once.relevance[index])

@@ -97,7 +97,7 @@ def test_the_local_change_compares_a_marker_with_its_surroundings():
 def test_even_channels_are_poly_cam_where_there_is_but_one_channel_to_weigh():
     model = two_layers(channels=1)
     found = even_channels(model, spot(), REFERENCE)
-    explained = PolyCam()(model, spot(), reference=REFERENCE[0]).saliency
+    explained = PolyCam()(model, spot(), reference=REFERENCE[0]).influence
     torch.testing.assert_close(found / found.max(), explained / explained.max())
 
 
@@ -107,7 +107,7 @@ def test_even_channels_do_not_know_what_the_answer_is_made_of():
     before, by_poly_cam = even_channels(model, spot(), REFERENCE), PolyCam()(model, spot(), reference=REFERENCE[0])
     nn.init.normal_(head.weight)
     torch.testing.assert_close(even_channels(model, spot(), REFERENCE), before)
-    assert not torch.allclose(PolyCam()(model, spot(), reference=REFERENCE[0]).saliency, by_poly_cam.saliency)
+    assert not torch.allclose(PolyCam()(model, spot(), reference=REFERENCE[0]).influence, by_poly_cam.influence)
 
 
 def test_the_centre_is_in_the_middle():

@@ -2,6 +2,7 @@
 
 import torch
 
+from sliplens.explainers.attribution import Attribution
 from sliplens.explainers.gradients import ExpectedGradients, IntegratedGradients, SmoothGrad
 from sliplens.explainers.occlusion import Occlusion
 from sliplens.explainers.shapley import Shapley
@@ -19,3 +20,9 @@ QUICK = {
     "shapley": Shapley(tile_px=32),
     "shapley-marker": Shapley(markers_px=MARKERS, pairs=8),
 }
+
+
+def saliency(attribution: Attribution) -> torch.Tensor:
+    """Supporting evidence over its largest value, as `Explanation.saliency`."""
+    supporting = torch.relu(attribution.influence)
+    return supporting / supporting.amax(dim=(1, 2), keepdim=True).clamp_min(1e-30)

@@ -216,15 +216,3 @@ class Attribution:
         if self.raises_only:
             return self.relevance
         return self.change.sign().to(self.relevance.dtype)[:, None, None] * self.relevance
-
-    @property
-    def saliency(self) -> Float[Tensor, "batch height width"]:
-        """Supporting evidence in [0, 1], for viewing: 1 at the strongest pixel of each image.
-
-        The map is relu(sign(f(x) - f(reference)) relevance) over its largest value: where the margin falls below the
-        reference's, the pixels that lower it; of a map that `raises_only` always those that raise it. A map without
-        supporting evidence stays zero.
-        """
-        supporting = torch.relu(self.influence)
-        peak = supporting.amax(dim=(1, 2), keepdim=True)
-        return supporting / torch.where(peak > 0, peak, torch.ones_like(peak))

@@ -51,7 +51,7 @@ class IntegratedGradients(Method):
     line, as it was published."""
     black: bool = False
     """Start from the black image instead, as published: relevance adds up to f(x) - f(black), and the reference only
-    decides what `saliency` shows."""
+    decides what `Explanation.saliency` shows."""
 
     def _explain(self, comparison: Comparison) -> Attribution:
         line, slopes = comparison, []
