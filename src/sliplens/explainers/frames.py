@@ -90,44 +90,36 @@ class ChosenFrames:
 
 
 def find_stick_frame(
-    frames: Iterable[UInt8[np.ndarray, "height width 3"]],
-    reference: UInt8[np.ndarray, "height width 3"] | None,
-    margin: Float[np.ndarray, " frames"] | None = None,
-) -> int:
-    """Find the last frame before the pull of a trial, from its labels or else by tracking its markers.
-
-    By labels it is the last frame before the first full slip whose margin is at least 97 % of the trial's largest.
-    `RecordingError` if the labels begin below a margin of 0.9, or the markers show no press.
-    """
-    if margin is not None and np.isfinite(margin).any():
-        slips = np.flatnonzero(margin <= 0)
-        before = margin[: slips[0]] if len(slips) else margin
-        largest = np.fmax.reduce(before, initial=0.0)
-        if largest < _LEAST_STICK:
-            raise RecordingError(f"no margin before the first full slip reaches {_LEAST_STICK:g}")
-        return int(np.flatnonzero(before >= _STICK_SHARE * largest)[-1])
-    if reference is None:
-        raise RecordingError("it has no labels, and no image of the untouched sensor to track markers from")
-    tracks = track_markers(frames, reference)
-    hold = find_hold(tracks.rest_px, tracks.displacement_px)
-    spread = affine_parts(tracks.rest_px, tracks.displacement_px[hold : hold + 1])[0, 2]
-    if not spread >= _LEAST_SPREAD:
-        raise RecordingError("its markers show no press")
-    return hold
-
-
-def try_stick_frame(
     trial: str,
     frames: Iterable[UInt8[np.ndarray, "height width 3"]],
     reference: UInt8[np.ndarray, "height width 3"] | None,
     margin: Float[np.ndarray, " frames"] | None = None,
 ) -> tuple[int | None, tuple[str, ...]]:
-    """Find the stick frame, or return None and a warning."""
-    try:
-        return find_stick_frame(frames, reference, margin), ()
-    except SliplensError as error:  # no stick, no markers, or no OpenCV
-        compared = "so frames are compared with the untouched sensor"
-        return None, (f"{trial}: the last frame before the pull was not found, {compared}: {error}",)
+    """Find the last frame before the pull of a trial, from its labels or else by tracking its markers.
+
+    By labels it is the last frame before the first full slip whose margin is at least 97 % of the trial's largest.
+    None and a warning if the labels begin below a margin of 0.9, or the markers show no press.
+    """
+    if margin is not None and np.isfinite(margin).any():
+        slips = np.flatnonzero(margin <= 0)
+        before = margin[: slips[0]] if len(slips) else margin
+        largest = np.fmax.reduce(before, initial=0.0)
+        if largest >= _LEAST_STICK:
+            return int(np.flatnonzero(before >= _STICK_SHARE * largest)[-1]), ()
+        reason = f"no margin before the first full slip reaches {_LEAST_STICK:g}"
+    elif reference is None:
+        reason = "it has no labels, and no image of the untouched sensor to track markers from"
+    else:
+        try:
+            tracks = track_markers(frames, reference)
+            hold = find_hold(tracks.rest_px, tracks.displacement_px)
+            if affine_parts(tracks.rest_px, tracks.displacement_px[hold : hold + 1])[0, 2] >= _LEAST_SPREAD:
+                return hold, ()
+            reason = "its markers show no press"
+        except SliplensError as error:  # no markers, or no OpenCV
+            reason = error
+    compared = "so frames are compared with the untouched sensor"
+    return None, (f"{trial}: the last frame before the pull was not found, {compared}: {reason}",)
 
 
 def frames_from_arrays(
@@ -171,7 +163,7 @@ def frames_from_arrays(
         references, name = small(np.broadcast_to(np.asarray(colour, np.uint8), frames.shape)), baseline
     else:
         if baseline == "stick":
-            stick, warnings = try_stick_frame("frames", frames, reference)
+            stick, warnings = find_stick_frame("frames", frames, reference)
         compared, name = (reference, "untouched") if stick is None else (frames[stick], "stick")
         if compared is None and not encoding.compares:
             name = "black"
@@ -292,7 +284,7 @@ def _take(
     stick, warnings = None, ()
     if isinstance(baseline, str) and baseline == "stick":
         baseline = "untouched"
-        stick, warnings = try_stick_frame(opened.trial, opened.read_frames(), untouched, opened.safety_margin)
+        stick, warnings = find_stick_frame(opened.trial, opened.read_frames(), untouched, opened.safety_margin)
     wanted = {*numbers} if stick is None else {*numbers, stick}
     frames = {
         number: frame for number, frame in enumerate(islice(opened.read_frames(), max(wanted) + 1)) if number in wanted

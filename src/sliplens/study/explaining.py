@@ -25,12 +25,12 @@ from sliplens.explainers.frames import (
     Baseline,
     ChosenFrames,
     FrameSelection,
+    find_stick_frame,
     frames_from_arrays,
     frames_from_dataset,
     frames_from_folder,
     nearest_frame,
     require_labels,
-    try_stick_frame,
 )
 from sliplens.explainers.occlusion import markers_in_recording
 from sliplens.explainers.table import EXPLAINERS, RECOMMENDED_METHOD
@@ -317,7 +317,7 @@ def make_strip(
     withheld = estimate.withheld(np.isfinite(margin))
     trusted = np.array([reason is None for reason in withheld])
     pictures, size = recording.frames[list(rows)], network.manifest.image_size
-    stick = try_stick_frame(recording.trial, recording.frames, recording.reference, margin)[0]
+    stick = find_stick_frame(recording.trial, recording.frames, recording.reference, margin)[0]
     stick = None if baseline == "untouched" else stick
     compared = "untouched" if stick is None else recording.frames[stick]
     chosen = frames_from_arrays(network, pictures, recording.reference, baseline=compared)
