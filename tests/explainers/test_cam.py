@@ -1,6 +1,7 @@
 import pytest
 import torch
 from captum import attr
+from quick import saliency
 from torch import nn
 from torchcam.methods import GradCAM, LayerCAM
 
@@ -124,7 +125,7 @@ def test_the_published_map_does_not_depend_on_the_reference(network, images, ref
     model = network("shufflenet")
     published = GradCam(published=True)
     one, other = published(model, images), published(model, images, reference=reference)
-    torch.testing.assert_close(one.influence, other.influence, atol=1e-6, rtol=1e-6)
+    torch.testing.assert_close(saliency(one), saliency(other), atol=1e-6, rtol=1e-6)
     assert not torch.equal(one.reference_prediction, other.reference_prediction)
     assert one.completeness_gap is None
 
