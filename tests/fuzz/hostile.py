@@ -13,7 +13,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import chdir
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from io import BytesIO
 from operator import itemgetter
@@ -440,8 +440,7 @@ def _robot(folder: Path) -> None:
 
 
 def _read_workspace(folder: Path) -> object:
-    found = load_results(folder / "work")
-    return repr(replace(found, workspace=Path("work")))
+    return repr(load_results(folder / "work"))
 
 
 def _arrays(change: Callable[[dict[str, np.ndarray], str, Rng], Any]) -> Change:
