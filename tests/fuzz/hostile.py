@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from lerobot_data import HEIGHT, LENGTHS, WIDTH, write_dataset
 from made_up import write_workspace
 from own_recording import write_video
 from PIL import Image
@@ -433,12 +432,6 @@ def _bag(folder: Path) -> None:
     write_bag(folder / "bag", sorted([*frames, *samples], key=itemgetter(2)))
 
 
-def _robot(folder: Path) -> None:
-    rng = np.random.default_rng(0)
-    frames = rng.integers(0, 256, (sum(LENGTHS), HEIGHT, WIDTH, 3), dtype=np.uint8)
-    write_dataset(folder / "robot", frames, rng.normal(size=(len(frames), 6)).astype(np.float32))
-
-
 def _read_workspace(folder: Path) -> object:
     return repr(load_results(folder / "work"))
 
@@ -550,7 +543,6 @@ def _frames_of(name: str, **options: Any) -> Callable[[Path], object]:
     return lambda folder: _read_frames(folder / name, **options)
 
 
-_ROBOT = ("robot/data/*/*.parquet", "robot/meta/episodes/*/*.parquet")
 _WEIGHTS = {**ANY, "header": _tensors, "not finite": _not_finite}
 FORMATS = {
     "data set": Format(_data_set, ("dataset.json",), {**ANY, **JSON}, _read_data_set),
@@ -575,8 +567,6 @@ FORMATS = {
     "images": Format(_own, ("cup/0*.png",), PICTURE, _frames_of("cup", frame_rate=30.0)),
     "video": Format(_video, ("cup.mkv",), ANY, _frames_of("cup.mkv")),
     "bag": Format(_bag, ("bag/bag.mcap",), ANY, _frames_of("bag/bag.mcap")),
-    "lerobot": Format(_robot, ("robot/meta/info.json",), {**ANY, **JSON}, _frames_of("robot")),
-    "lerobot tables": Format(_robot, _ROBOT, TABLES, _frames_of("robot")),
     "toml": Format(_text("tip.toml"), ("*.toml",), TOML, _read_toml),
 }
 """Every kind of input."""

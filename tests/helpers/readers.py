@@ -7,7 +7,7 @@ from typing import TypeVar
 import pytest
 
 from sliplens.errors import InputError
-from sliplens.recordings.formats import images, lerobot, rosbag, tables, thesis, video
+from sliplens.recordings.formats import images, rosbag, tables, thesis, video
 from sliplens.recordings.options import ReadOptions
 
 Found = TypeVar("Found")
@@ -19,7 +19,6 @@ def _by_keyword(read: Callable[[Path, ReadOptions], Found]) -> Callable[..., Fou
 
 read_force_table = _by_keyword(tables.read_force_table)
 read_image_folder = _by_keyword(images.read_image_folder)
-read_lerobot = _by_keyword(lerobot.read_lerobot)
 read_rosbag = _by_keyword(rosbag.read_rosbag)
 read_thesis = _by_keyword(thesis.read_thesis)
 read_video = _by_keyword(video.read_video)

@@ -260,7 +260,7 @@ def import_recordings(
     Parameters
     ----------
     sources
-        Bags, videos, folders of images, LeRobot data sets, lists of the thesis or data sets of sliplens. In a folder of
+        Bags, videos, folders of images, lists of the thesis or data sets of sliplens. In a folder of
         recordings or a manifest (`sliplens.recordings.manifest`) a trial that cannot be imported, or that ended its
         process three times, does not stop the others: `Dataset.left_out` lists it, and `add` tries it again.
     out

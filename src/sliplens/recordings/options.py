@@ -51,10 +51,6 @@ class ReadOptions:
     """Topic of the images; the only one if not given."""
     wrench_topic: str | None = None
     """Topic of the forces; the only one if not given."""
-    camera_key: str | None = None
-    """Feature of a LeRobot data set with the images."""
-    force_key: str | None = None
-    """Feature of a LeRobot data set with the forces."""
     image_root: Path | None = None
     """Folder that now holds the images whose old paths a list of the thesis names."""
 

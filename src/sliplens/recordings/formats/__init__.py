@@ -14,7 +14,6 @@ from sliplens.images import IMAGE_SUFFIXES
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import DATASET_FILE, load_dataset
 from sliplens.recordings.formats.images import find_states, read_image_folder, read_stills
-from sliplens.recordings.formats.lerobot import read_lerobot
 from sliplens.recordings.formats.rosbag import read_rosbag
 from sliplens.recordings.formats.thesis import is_thesis_list, read_thesis
 from sliplens.recordings.formats.video import read_video
@@ -46,12 +45,6 @@ _ROWS = {
         recognises=lambda path: path.suffix in {".mcap", ".db3"} or (path / "metadata.yaml").is_file(),
         takes=("image_topic", "wrench_topic"),
         read=read_rosbag,
-    ),
-    "lerobot": Reader(
-        words="LeRobot v3 data set",
-        recognises=lambda path: (path / "meta" / "info.json").is_file(),
-        takes=("camera_key", "force_key"),
-        read=read_lerobot,
     ),
     "thesis": Reader(
         words="lists of the thesis (*_images_L.txt), with their margins",
