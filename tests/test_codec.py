@@ -15,7 +15,6 @@ from sliplens.codec import (
     TABLE_SUFFIXES,
     UNKNOWN,
     Columns,
-    keep_part,
     load_record,
     load_result,
     read_written,
@@ -128,20 +127,6 @@ def test_arrays_damaged_inside_are_told(tmp_path, rng):
         path.write_bytes(whole[:at] + bytes(64) + whole[at + 64 :])
         with pytest.raises(InputError, match="cannot be read as arrays"):
             load_result(tmp_path, Noise, command="sliplens x")
-
-
-def test_a_part_is_made_once_and_again_where_it_is_damaged(tmp_path):
-    made = []
-
-    def make() -> Part:
-        made.append("part")
-        return Part(name="a", error=0.5, curve=(1.0,))
-
-    assert keep_part(None, Part, make) == keep_part(tmp_path / "a", Part, make) == keep_part(tmp_path / "a", Part, make)
-    assert len(made) == 2  # once for none, which keeps nothing
-    (tmp_path / "a" / "result.json").write_bytes(b"")
-    assert keep_part(tmp_path / "a", Part, make) == make()
-    assert load_result(tmp_path / "a", Part, command="sliplens x") == make()
 
 
 def test_a_column_of_another_type_is_told(tmp_path):

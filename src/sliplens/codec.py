@@ -319,19 +319,6 @@ def load_result(folder: Path, kind: type[Record], *, command: str) -> Record:
         raise InputError(f"{folder} {error}; {cure}") from None
 
 
-def keep_part(part: Path | None, kind: type[Record], make: Callable[[], Record]) -> Record:
-    """Make a piece of long work, or read it from its folder where an interrupted run has made it; None keeps none."""
-    if part is None:
-        return make()
-    if (part / RESULT_FILE).is_file():
-        with suppress(InputError):  # damaged as the machine went down: nobody could make this part alone again
-            return load_result(part, kind, command="sliplens")
-    piece = make()
-    part.mkdir(parents=True, exist_ok=True)
-    save_result(piece, part)
-    return load_result(part, kind, command="sliplens")
-
-
 MOST_EXPANDED, MOST_TIMES = 256 * 2**20, 100
 """Bytes that a compressed table may hold, or how many times its size; ours hold some ten times theirs."""
 _MOST_ROWS, _MOST_REPEATED = 2**25, 2**31  # rows, and bytes of values that are written once and counted often
@@ -481,7 +468,7 @@ ARRAY_DAMAGE = (
 """Errors of NumPy on a damaged array or archive."""
 
 
-TABLE_SUFFIXES = (".parquet", ".csv", ".json")  #: Endings of the tables that can be written.
+TABLE_SUFFIXES = (".parquet", ".csv")  #: Endings of the tables that can be written.
 
 
 def regrouped(tables: Iterable[pa.Table], *, rows: int) -> Iterator[pa.Table]:
@@ -506,16 +493,14 @@ def read_written(path: Path, schema: pa.Schema) -> pa.Table:
         # none of Python's own: Arrow's thread may let go of it when Python has ended, and that aborts the process
         with pa.OSFile(str(path)) as stream:
             return pa_csv.read_csv(stream, convert_options=options)
-    if path.suffix == ".json":
-        return pa.Table.from_pylist(msgspec.json.decode(path.read_bytes()), schema)
     return open_table(path).read()
 
 
 def write_tables(tables: Iterable[pa.Table], path: Path | None, schema: pa.Schema) -> pa.Table | None:
     """Write tables into one file, each as it comes; whole or not at all.
 
-    The file is CSV or JSON (a list, one object a row) by its ending, else Parquet, a row group a table. A file that is
-    there is replaced; without a path the tables are joined in memory and returned.
+    The file is CSV by its ending, else Parquet, a row group a table. A file that is there is replaced; without a path
+    the tables are joined in memory and returned.
 
     Raises
     ------
@@ -526,13 +511,6 @@ def write_tables(tables: Iterable[pa.Table], path: Path | None, schema: pa.Schem
         # no empty table before them: each column would begin with an empty chunk
         return pa.concat_tables(list(tables) or [schema.empty_table()]).replace_schema_metadata(schema.metadata)
     with whole_file(path) as part:
-        if path.suffix == ".json":
-            rows = (msgspec.json.encode(row) for table in tables for row in table.to_pylist())
-            with part.open("wb") as stream:
-                stream.write(b"[\n" + next(rows, b""))
-                stream.writelines(b",\n" + row for row in rows)
-                stream.write(b"\n]\n")
-            return None
         csv = path.suffix == ".csv"
         with pa_csv.CSVWriter(part, schema) if csv else pq.ParquetWriter(part, schema, compression="zstd") as writer:
             for table in tables:
@@ -562,6 +540,6 @@ def one_line(error: Exception) -> str:
 
 
 __all__ = [
-    "Columns", "Result", "from_builtins", "keep_part", "load_record", "load_result", "save_record", "save_result",
+    "Columns", "Result", "from_builtins", "load_record", "load_result", "save_record", "save_result",
     "to_builtins", "write_tables",
 ]  # fmt: skip

@@ -110,17 +110,6 @@ def test_labels_that_were_not_found_are_not_overwritten(simulated: Path, capsys:
     assert (simulated / "dataset.json").read_bytes() == before
 
 
-def test_pages_alone_are_drawn_of_what_was_imported(
-    tmp_path: Path, trial: Recording, simulated: Path, relabelled: Path, capsys: pytest.CaptureFixture[str]
-):
-    before = load_dataset(relabelled).hash
-    assert run("label", relabelled, "--audit-only", "-o", tmp_path) == 0
-    assert (tmp_path / "audit" / f"{trial.trial}.png").is_file()
-    assert load_dataset(relabelled).hash == before
-    capsys.readouterr()
-    assert "was not imported" in refused(capsys, "label", simulated, "--audit-only")
-
-
 def test_changed_force_samples_are_found(tmp_path: Path, trial: Recording, relabelled: Path):
     shutil.copytree(relabelled, tmp_path / "data")
     forces_path(tmp_path / "data", trial.trial).write_bytes(b"PAR1")

@@ -56,7 +56,6 @@ MISTAKES = {
     "split DATA --splits object": "the object of",
     "split NOTHING --splits trial": "does not exist",
     "label DATA --draft OUT -o EMPTY": "leave",
-    "label DATA --audit-only --corrections OUT": "leave",
     "export onnx DATA -o OUT.onnx": "does not exist; make it with",
     "export onnx RUN -o OUT": "does not end in .onnx",
     "track DATA -o OUT.csv": "does not end in .parquet",

@@ -1,6 +1,5 @@
 """`sliplens predict`: the file it writes, and what is said to mistakes."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -70,8 +69,8 @@ def test_engines_agree_on_a_folder_of_images(difference_run: Path, difference_fo
 
 
 def test_few_frames_are_told_one_by_one(difference_run: Path, difference_folder: Path, tmp_path: Path, capsys):
-    run(difference_run, difference_folder, "-o", tmp_path / "a.json")
-    rows = json.loads((tmp_path / "a.json").read_text())
+    run(difference_run, difference_folder, "-o", tmp_path / "a.parquet")
+    rows = pq.read_table(tmp_path / "a.parquet").to_pylist()
     lines = capsys.readouterr().out.splitlines()
     for row in rows:
         (line,) = (line for line in lines if row["file"] in line)

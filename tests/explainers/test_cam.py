@@ -3,10 +3,10 @@ import torch
 from captum import attr
 from quick import saliency
 from torch import nn
-from torchcam.methods import GradCAM, LayerCAM
+from torchcam.methods import GradCAM
 
 from sliplens.errors import ModelError
-from sliplens.explainers.cam import GradCam, HiResCam, LayerCam, capture
+from sliplens.explainers.cam import GradCam, capture
 
 
 def captured(model: nn.Module, images, layer: str):
@@ -54,45 +54,6 @@ def test_equals_captum_with_its_sign(name, layer, network, images):
         attr.LayerGradCam(lambda x: model(x).flatten(), model.get_submodule(layer)).attribute(images)
     )
     torch.testing.assert_close(GradCam.cells(activations, gradients), oracle[:, 0].detach(), atol=1e-9, rtol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("name", "layer"), [("shufflenet", "stage3"), ("mobilenet", "features.3"), ("resnet", "layer2")]
-)
-def test_layer_cam_equals_torch_cam(name, layer, network, images):
-    model = network(name)
-    activations, gradients, _ = captured(model, images, layer)
-    with LayerCAM(model, target_layer=layer) as extractor:
-        oracle = extractor(0, model(images.clone().requires_grad_()), normalized=False)[0]
-    torch.testing.assert_close(torch.relu(LayerCam.cells(activations, gradients)), oracle, atol=1e-6, rtol=0)
-
-
-@pytest.mark.parametrize("name", ["shufflenet", "resnet", "vgg", "gap"])
-def test_hires_cam_is_grad_cam_before_a_pooled_linear_head(name, network, images, reference):
-    model = network(name)
-    hires, plain = (explain()(model, images, reference=reference) for explain in (HiResCam, GradCam))
-    if name == "vgg":
-        # the maximum of 2 x 2 cells hands its gradient to one of them
-        assert not torch.allclose(hires.relevance, plain.relevance, atol=1e-6)
-    else:
-        torch.testing.assert_close(hires.relevance, plain.relevance, atol=1e-7, rtol=1e-5)
-
-
-def test_hires_and_layer_cam_weigh_each_cell_by_its_own_gradient(network, images, reference):
-    model = network("vgg")
-    activations, gradients, prediction = captured(model, images, "features.19")
-    references, _, empty = captured(model, reference.expand_as(images), "features.19")
-    sign = torch.sign(prediction - empty)
-    hires, layered = torch.zeros(2, len(images), 4, 4, dtype=torch.float64)
-    for image, channel, row, column in torch.cartesian_prod(*map(torch.arange, activations.shape)).tolist():
-        slope = gradients[image, channel, row, column]
-        added = activations[image, channel, row, column] - references[image, channel, row, column]
-        hires[image, row, column] += slope * added
-        layered[image, row, column] += max(sign[image] * slope, 0) * sign[image] * added
-    for explain, cells in ((HiResCam(), hires), (LayerCam(), layered)):
-        upsampled = nn.functional.interpolate(cells[None], size=(64, 64), mode="bilinear", align_corners=False)[0]
-        relevance = explain(model, images, reference=reference).relevance
-        torch.testing.assert_close(relevance, (upsampled / 16**2).float(), atol=1e-7, rtol=1e-5)
 
 
 def test_images_and_references_share_a_pass(network, images):

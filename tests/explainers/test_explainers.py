@@ -32,11 +32,10 @@ QUICK = DEFAULTS | {
     "shapley": Shapley(tile_px=32),
     "shapley-marker": Shapley(markers_px=MARKERS),
 }
-CAMS = ["grad-cam", "hires-cam", "layer-cam", "poly-cam"]
+CAMS = ["grad-cam", "poly-cam"]
 # what adds up to f(x) - f(reference), for some networks at least
 COMPLETE = [
     "grad-cam",
-    "hires-cam",
     "poly-cam",
     "integrated-gradients",
     "expected-gradients",

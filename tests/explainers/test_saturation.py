@@ -9,7 +9,7 @@ from sliplens.explainers.gradients import IntegratedGradients, SmoothGrad
 
 # noise as small as a flat network is flat for
 METHODS = DEFAULTS | {"smooth-grad": SmoothGrad(samples=4, noise=0.01)}
-BY_GRADIENT = ("grad-cam", "hires-cam", "layer-cam", "smooth-grad", "integrated-gradients")
+BY_GRADIENT = ("grad-cam", "smooth-grad", "integrated-gradients")
 
 
 class Sigmoid(nn.Module):

@@ -193,18 +193,6 @@ def call_sensor_new(call: Any) -> None:
     print_file(path.with_suffix(".png"), "what the profile does to a frame")
 
 
-@command("sensor list", "recordings.sensor:shipped_profiles", "sliplens sensor list")
-def call_sensor_list(call: Any) -> None:
-    """Print the profiles."""
-    from sliplens.recordings.sensor import load_profile
-
-    profiles = {name: load_profile(name) for name in call()}
-    rows = [
-        (name, profile.markers or "none", str(profile.camera_size_px or "any")) for name, profile in profiles.items()
-    ]
-    print_table("Sensor profiles", ("name", "markers", "camera, width x height"), rows)
-
-
 @command("simulate", "simulation.trials:simulate", "sliplens simulate runs/mine/data --preset small")
 def call_simulate(call: Any, *, preview: Path | None = None) -> None:
     """Print the splits.
@@ -251,7 +239,7 @@ def call_import(call: Any, *, audit: bool = True) -> None:
 
 
 @command("label", "recordings.corrections:label_dataset", "sliplens label runs/mine/data --draft corrections.csv")
-def call_label(call: Any, *, draft: Path | None = None, audit: bool = True, audit_only: bool = False) -> None:
+def call_label(call: Any, *, draft: Path | None = None, audit: bool = True) -> None:
     """Print what the labels rest on.
 
     Parameters
@@ -260,25 +248,18 @@ def call_label(call: Any, *, draft: Path | None = None, audit: bool = True, audi
         Change no label: write a table of the present labels, to be edited and given to --corrections.
     audit
         Draw a page for each trial, in `audit/` of the folder, from which to judge its labels.
-    audit_only
-        Change no label: draw the audit pages of the present labels.
     """
     from sliplens.recordings.corrections import draft_corrections
     from sliplens.recordings.dataset import load_dataset
 
     arguments = call.keywords
-    if draft is not None and (arguments.keys() & {"out", "corrections"} or audit_only):
-        raise InputError("--draft changes no label; leave --out, --corrections and --audit-only out")
-    if audit_only and "corrections" in arguments:
-        raise InputError("--audit-only changes no label; leave --audit-only or --corrections out")
+    if draft is not None and arguments.keys() & {"out", "corrections"}:
+        raise InputError("--draft changes no label; leave --out and --corrections out")
     folder = arguments["data"]
     data, out = load_dataset(folder), Path(arguments.get("out") or folder)
     if draft is not None:
         draft_corrections(data, draft)
         print_file(draft, f"edit it, then: sliplens label {folder} --corrections {draft}")
-        return
-    if audit_only:
-        output.draw_audits(data, out / "audit")
         return
     output.show_labelled("Labelled", call(data=data, out=out), audit=audit)
 
@@ -419,7 +400,7 @@ def call_evaluate(call: Any, *, device: str = "cpu") -> None:
     "predict",
     "models.predictions:predict",
     "sliplens predict cup.mp4 --sensor tip.toml --plot margin.png -o margins.csv",
-    suffixes=(".parquet", ".csv", ".json"),
+    suffixes=(".parquet", ".csv"),
 )
 def call_predict(call: Any, *, plot: Path | None = None) -> None:
     """Print the margins.

@@ -204,8 +204,6 @@ class GradCam(Method):
     """
 
     method: ClassVar[str] = "grad-cam"
-    one_sided: ClassVar[bool] = False
-    """True if only gradients along the change of the prediction count."""
     published: bool = False
     """Weigh A(x) and keep the cells above zero, those that raise the prediction, whichever way it went. The map is then
     scaled to add up to |f(x) - f(b)|, a convention; its pixels are ranked and shown in the published order."""
@@ -235,9 +233,8 @@ class GradCam(Method):
             (gradients,) = torch.autograd.grad(both[: len(images)].sum(), outputs[layer.name])
             activations, base = outputs[layer.name].detach().tensor_split([len(images)])
             prediction, low = both.detach().tensor_split([len(images)])
-            sign = (prediction - low).sign()[:, None, None] if self.one_sided else torch.ones(1, 1, 1).to(prediction)
             contrast = activations if self.published else activations - base
-            cells = sign * self.cells(contrast, sign[:, None] * gradients[: len(images)])
+            cells = self.cells(contrast, gradients[: len(images)])
             maps.append(spread(torch.relu(cells) if self.published else cells, size))
             predictions.append(torch.stack([prediction, low.expand_as(prediction)]))
         comparison.prediction, comparison.reference_prediction = torch.cat(predictions, dim=1)
@@ -246,48 +243,8 @@ class GradCam(Method):
             relevance = scale_to(relevance, total=comparison.change.abs())
         return comparison.attribution(
             relevance,
-            complete=not self.published and not self.one_sided,
+            complete=not self.published,
             target=f"{'f(x)' if self.published else 'f(x) - f(reference)'}, through layer {layer.name}",
             warnings=comparison.saturated(relevance.abs().sum(dim=(1, 2)).tolist()),
             raises_only=self.published,
         )
-
-
-@dataclass(frozen=True, kw_only=True)
-class HiResCam(GradCam):
-    """HiResCAM: Grad-CAM with each cell weighted by its own gradient; the same where the head is the mean over space.
-
-    References
-    ----------
-    Draelos and Carin, *Use HiResCAM instead of Grad-CAM for faithful explanations of convolutional neural networks*,
-    2020, eq. 3.
-    """
-
-    method: ClassVar[str] = "hires-cam"
-
-    @staticmethod
-    def cells(activations: _Maps, gradients: _Maps) -> _Cells:
-        """Sum over c of df/dA_c A_c."""
-        return (gradients * activations).sum(dim=1)
-
-
-@dataclass(frozen=True, kw_only=True)
-class LayerCam(GradCam):
-    """LayerCAM: HiResCAM of the gradients that point the way the prediction went.
-
-    With s = sign(f(x) - f(b)) the map is s sum over c of relu(s df/dA_c) (A_c(x) - A_c(b)); the published one keeps
-    the gradients above zero, those that raise a class. It adds up to nothing in particular.
-
-    References
-    ----------
-    Jiang et al., *LayerCAM: Exploring hierarchical class activation maps for localization*, IEEE TIP 2021, eqs. 4 to 6,
-    without the ReLU of eq. 6.
-    """
-
-    method: ClassVar[str] = "layer-cam"
-    one_sided: ClassVar[bool] = True
-
-    @staticmethod
-    def cells(activations: _Maps, gradients: _Maps) -> _Cells:
-        """Sum over c of relu(df/dA_c) A_c."""
-        return (torch.relu(gradients) * activations).sum(dim=1)

@@ -49,8 +49,6 @@ _ROWS = {
     "poly-cam-thesis": ExplainerRow(
         "Poly-CAM as in the thesis", _method("poly_cam", "PolyCam", published=True, level=5), "#E69F00", (0, (5, 1))
     ),
-    "hires-cam": ExplainerRow("HiResCAM", _method("cam", "HiResCam")),
-    "layer-cam": ExplainerRow("LayerCAM", _method("cam", "LayerCam")),
     "expected-gradients": ExplainerRow("Expected Gradients", _method("gradients", "ExpectedGradients")),
     "smooth-grad": ExplainerRow("SmoothGrad", _method("gradients", "SmoothGrad")),
     "occlusion": ExplainerRow("Occlusion", _method("occlusion", "Occlusion"), "#0072B2", (0, (3, 1, 1, 1))),

@@ -13,10 +13,10 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Int
 
-from sliplens.codec import keep_part, load_result, save_result
+from sliplens.codec import load_result, save_result
 from sliplens.errors import InputError
 from sliplens.extras import pick
-from sliplens.files import DEFAULT_NETWORK, output_folder, remove, to_builtins
+from sliplens.files import DEFAULT_NETWORK, output_folder, to_builtins
 from sliplens.friction import Friction, FrictionLike, SlipLearner, as_friction
 from sliplens.grip.controllers import SPRINGS_BACK_S, Controller, Observation, SlipGate, make_controller
 from sliplens.grip.fingertip import (
@@ -165,18 +165,16 @@ def run_episodes(
         )
 
         def run(folder: Path | None) -> Grip:
-            """Run every batch that is not in the folder yet, and write the record."""
+            """Run every batch, and write the record."""
             begin, size, done = time.perf_counter(), 1 if rendered else _BATCH, list[Grip]()
             chunks = [np.arange(first, min(first + size, episodes)) for first in range(0, episodes, size)]
             with open_stage("Gripping"):
                 for number, rows in enumerate(report_each(chunks, sizes=list(map(len, chunks)))):
-                    part = None if folder is None else folder / "parts" / str(number)
-                    done.append(keep_part(part, Grip, partial(run_batch, number, rows)))
+                    done.append(run_batch(number, rows))
             joined = EpisodeTable.joined([batch.episodes for batch in done])
             grip = replace(done[0], seconds=time.perf_counter() - begin, episodes=joined)
             if folder is not None:
                 save_result(grip, folder)
-                remove(folder / "parts")
             return grip
 
         if out is None:
