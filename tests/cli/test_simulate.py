@@ -1,11 +1,10 @@
-"""`sliplens simulate`: data sets, previews, and what it says to mistakes."""
+"""`sliplens simulate`: data sets, and what it says to mistakes."""
 
 import json
 from pathlib import Path
 
 import pytest
 from command_line import refused, run
-from PIL import Image
 
 from sliplens.recordings import load_dataset
 from sliplens.simulation import PRESETS, make_recipe
@@ -26,14 +25,6 @@ def test_a_data_set_is_written_whole_and_kept(tmp_path: Path, capsys: pytest.Cap
     assert run(*command) == 0
     assert "kept" in capsys.readouterr().out
     assert "other settings" in refused(capsys, *command, "--seed", 1)
-
-
-def test_a_preview_needs_no_folder(tmp_path: Path):
-    sheet = tmp_path / "sheet.png"
-    assert run("simulate", *SMALL, "--preview", sheet) == 0
-    with Image.open(sheet) as image:
-        assert image.width >= 1600
-    assert {path.name for path in tmp_path.iterdir()} == {"sheet.png"}
 
 
 def test_options_change_a_preset_and_drop_its_totals():

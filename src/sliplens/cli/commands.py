@@ -194,28 +194,14 @@ def call_sensor_new(call: Any) -> None:
 
 
 @command("simulate", "simulation.trials:simulate", "sliplens simulate runs/mine/data --preset small")
-def call_simulate(call: Any, *, preview: Path | None = None) -> None:
-    """Print the splits.
-
-    Parameters
-    ----------
-    preview
-        Picture to write: a contact sheet of four trials (PNG, PDF or SVG). No data set is made without OUT.
-    """
-    from sliplens.plots.style import require_picture_path
-
-    if not (call.keywords.get("out") or preview):
-        raise InputError("nothing to do; name a folder to make, or a picture with --preview")
-    if preview is not None:
-        require_picture_path(preview, example="sheet.png")
-        options = {name: call.keywords[name] for name in call.keywords.keys() - {"out", "overwrite", "on_progress"}}
-        output.draw_simulation(preview, **options)
-    if call.keywords.get("out"):
-        frames: dict[str, list[int]] = {}
-        for trial in call().trials:
-            frames.setdefault(trial.split, []).append(trial.frames)
-        rows = [(split, str(len(counts)), f"{sum(counts):,}") for split, counts in frames.items()]
-        print_table("Simulated", ("split", "trials", "frames"), rows)
+def call_simulate(call: Any) -> None:
+    """Print the splits."""
+    require_out(call, "folder of the data set")
+    frames: dict[str, list[int]] = {}
+    for trial in call().trials:
+        frames.setdefault(trial.split, []).append(trial.frames)
+    rows = [(split, str(len(counts)), f"{sum(counts):,}") for split, counts in frames.items()]
+    print_table("Simulated", ("split", "trials", "frames"), rows)
 
 
 @command(

@@ -3,10 +3,10 @@
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Unpack
+from typing import TYPE_CHECKING
 
 from sliplens.cli.console import Terminal, print_file, print_table, say
-from sliplens.progress import fold_equal, number_of, open_stage, report_file, reporting
+from sliplens.progress import fold_equal, number_of
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from sliplens.report.page import Written
     from sliplens.results.evaluation import Evaluation, RegressionScores
     from sliplens.results.faithfulness import Faithfulness
-    from sliplens.simulation.plan import RecipeChanges
 
 _MOST_ROWS = 24
 """Number of frames or trials that are listed one by one."""
@@ -78,21 +77,6 @@ def _percent(value: float | None) -> str:
 
 def _interval(low: float | None, high: float | None) -> str:
     return "-" if low is None or high is None else f"{100 * low:.0f} to {100 * high:.0f} %"
-
-
-def draw_simulation(preview: Path, *, preset: str = "small", **changes: "Unpack[RecipeChanges]") -> None:
-    """Draw the contact sheet of a simulated data set."""
-    from sliplens.plots.sheets import draw_contact_sheet
-    from sliplens.plots.style import save_page
-    from sliplens.simulation import make_recipe, simulate_examples
-
-    recipe = make_recipe(preset, **changes)
-    with reporting(Terminal()):
-        with open_stage("Simulating trials for the preview"):
-            recordings = simulate_examples(recipe)
-        title = f"Simulated {recipe.sensor.name}, {recipe.resolved_displacement} displacement, seed {recipe.seed}"
-        save_page(draw_contact_sheet(recordings, title=title), preview)
-        report_file(preview, f"{len(recordings)} of the trials that this recipe makes")
 
 
 def draw_audits(data: "Dataset", folder: Path) -> None:

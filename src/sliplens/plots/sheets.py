@@ -1,31 +1,27 @@
-"""Pictures of trials: the contact sheet of several, and the audit page of an imported one."""
+"""Picture of a trial over time, and the audit page of an imported one."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from textwrap import shorten, wrap
+from textwrap import wrap
 
 import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from scipy.ndimage import binary_dilation
 
 from sliplens.errors import InputError
 from sliplens.images import absolute_difference
 from sliplens.plots import style
-from sliplens.plots.saliency import PictureRow, draw_pictures
 from sliplens.plots.style import BLACK, BLUE, GREEN, GREY, PURPLE, SKY, VERMILLION, drawing_style, save_page
 from sliplens.progress import OnProgress, open_stage, report_each, reporting
 from sliplens.recordings import ContactState, Dataset, Recording
 from sliplens.recordings.dataset import trial_path
 from sliplens.recordings.labelling import FrictionEstimate, LabelBasis, Labelling
 from sliplens.recordings.store import load_recording, read_frames, read_header
-from sliplens.recordings.trial import OUTSIDE, STICKS
 from sliplens.results.explanation import MARGIN_LEVELS
 
 STATE_COLOURS = dict(zip(ContactState, (style.GREY, style.BLUE, style.ORANGE, style.VERMILLION, "white"), strict=True))
@@ -62,51 +58,6 @@ def plot_margin(recording: Recording, *, ax: Axes) -> Axes:
 
 _REACHED_WITHIN = 0.1 - 1e-9  # half the distance between two columns: no frame stands in both
 _ALIKE = 0.005  # margins that are equal in whole percents
-
-
-def _paint_outlines(camera: UInt8[np.ndarray, "height width 3"], contact: UInt8[np.ndarray, "height width"]) -> None:
-    """Paint white around the contact, and blue inside its stick zone, both with a dark rim: neither hides the other."""
-    thick, (touches, loose) = max(1, len(contact) // 224), (contact != OUTSIDE, contact != STICKS)
-    for zone, inner in ((touches, "white"), (loose, style.SKY)):
-        for steps, colour in ((2, style.BLACK), (1, inner)):
-            rim = binary_dilation(zone, iterations=steps * thick) & ~zone
-            camera[rim] = np.round(255 * np.array(to_rgb(colour)))
-
-
-def draw_contact_sheet(recordings: Sequence[Recording], *, title: str | None = None) -> Figure:
-    """Draw two rows a trial: frames from the untouched sensor to full slip, and their differences.
-
-    Frames are those of `choose_untouched` and `choose_margins`; difference images are brightened by one factor, so that
-    trials compare. Outlines of the true contact (white) and stick zone (blue) lie over the frames of simulated trials.
-    """
-    if not recordings:
-        raise InputError("a contact sheet needs a trial; give at least one recording")
-    chosen = [[choose_untouched(recording), *choose_margins(recording)] for recording in recordings]
-    factor = brightening(
-        [
-            absolute_difference(recording.frames[[at for at in row if at is not None]], recording.reference)
-            for recording, row in zip(recordings, chosen, strict=True)
-        ]
-    )
-    rows = []
-    for recording, row in zip(recordings, chosen, strict=True):
-        cameras, differences, words = [], [], []
-        for column, index in enumerate(row):
-            camera = (recording.reference if index is None else recording.frames[index]).copy()
-            difference = brighten(absolute_difference(camera, recording.reference), factor)
-            if index is None and column:
-                camera, difference = (np.full_like(picture, 255) for picture in (camera, difference))
-            elif index is not None and recording.truth is not None:
-                _paint_outlines(camera, recording.truth.contact_map[index])
-            cameras.append(camera)
-            differences.append(difference)
-            moment = "" if index is None else f"{recording.time_s[index]:.1f} s, {recording.contact_state[index]}"
-            words.append(moment or ("no frame" if column else "reference"))
-        name = f"{shorten(recording.trial, 36, placeholder='…')}, {recording.condition}, day {recording.day}"
-        rows.append(PictureRow(name=name, pictures=cameras, words=words))
-        rows.append(PictureRow(name=f"difference {TIMES} {factor:g}", pictures=differences))
-    heads = ["untouched", *(f"Γ {style.percent(level)}" for level in MARGIN_LEVELS)]
-    return draw_pictures(rows, heads=heads, title=title)
 
 
 def choose_margins(recording: Recording) -> list[int | None]:

@@ -79,16 +79,6 @@ def simulate_trial(plan: TrialPlan) -> Recording:
     )
 
 
-def simulate_examples(recipe: SimulationRecipe) -> list[Recording]:
-    """Simulate up to four trials that show the range of a recipe, a wet one last."""
-    plans = plan_trials(recipe)
-    dry = [plan for plan in plans if plan.condition == "dry"]
-    wet = [plan for plan in plans if plan.condition == "wet"][:1]
-    count = min(4 - len(wet), len(dry))
-    chosen = [dry[index * (len(dry) - 1) // max(1, count - 1)] for index in range(count)] + wet
-    return [simulate_trial(plan) for plan in report_each(chosen)]
-
-
 def simulate(
     out: Path | str | None = None,
     *,
