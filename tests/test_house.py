@@ -26,13 +26,13 @@ def read(one: int, told: dict[str, Any], **more: object) -> int:
 def _read() -> dict[str, object]: ...
 '''
 ALLOWED = {
-    "lines": 37_420,
-    "modules": 152,
-    "riddles_per_1000": 0.3,
+    "lines": 35_951,
+    "modules": 148,
+    "riddles_per_1000": 0.25,
     "vague_docstrings": 0,
     "most_parameters": 12,
-    "functions_with_on_progress": 15,
-    "functions_with_out": 20,
+    "functions_with_on_progress": 14,
+    "functions_with_out": 18,
     "functions_with_overwrite": 19,
     "functions_with_device": 6,
     "names_defined_twice": 0,

@@ -50,9 +50,9 @@ def test_frames_are_compared_with_the_untouched_sensor_and_explained_against_it(
 
 
 def test_difference_images_need_no_reference_and_other_networks_do(trained):
-    explanation = sliplens.explain(trained("difference"), FRAMES, method="grad-cam")
+    explanation = sliplens.explain(trained("difference"), FRAMES, method="occlusion")
     assert not explanation.references.any()
-    assert np.isnan(explanation.to_arrow()["completeness_gap"].to_numpy()).all()  # LayerCAM promises no sum
+    assert np.isnan(explanation.to_arrow()["completeness_gap"].to_numpy()).all()  # occlusion promises no sum
     with pytest.raises(InputError, match="a network on raw images needs the untouched sensor; give it as reference"):
         sliplens.explain(trained("raw"), FRAMES, method="grad-cam")
 

@@ -183,6 +183,12 @@ def has_ratio(labels: Labels) -> bool:
     return bool(np.isfinite(trial_friction(labels)) and np.isfinite(_ratios(labels)[labels.labelled]).any())
 
 
+def require_one_size(data: Dataset, trials: Sequence[TrialInfo]) -> None:
+    """Refuse trials of several sensors: a network takes frames of one size."""
+    if len({(info.height, info.width) for info in trials}) > 1:
+        raise RecordingError(f"{data.folder} mixes frames of several sizes; use one sensor at a time")
+
+
 def load_frames(
     data: Dataset,
     trials: Sequence[TrialInfo],
@@ -198,8 +204,7 @@ def load_frames(
     `untouched_share` adds the untouched sensor, with the label 1 (the limit of light touches), this often for each
     labelled frame and at least once a trial: a network trained on it gives explanations a meaningful reference.
     """
-    if len(sizes := {(info.height, info.width) for info in trials}) > 1:
-        raise RecordingError(f"{data.folder} mixes frames of {sorted(sizes)} pixels; use one sensor at a time")
+    require_one_size(data, trials)
 
     def copies_of(labelled: int) -> int:
         return max(1, round(untouched_share * labelled)) if untouched_share > 0 else 0

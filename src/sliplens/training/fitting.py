@@ -46,6 +46,7 @@ from sliplens.training.data import (
     get_augmentation,
     has_ratio,
     load_frames,
+    require_one_size,
 )
 from sliplens.training.module import (
     Patience,
@@ -233,6 +234,7 @@ def _choose_trials(data: Dataset, condition: str | None) -> tuple[tuple[TrialInf
     except RecordingError as error:
         cure = "divide it" if condition is None else "name another --condition, or divide it"
         raise RecordingError(f"{error}; {cure} with `sliplens split`") from None
+    require_one_size(data, (*train, *validation))
     labels = [data.read_labels(info) for info in train]
     margins = np.concatenate([some.safety_margin[some.labelled] for some in labels])
     # rounding of margins that were computed from constant forces
