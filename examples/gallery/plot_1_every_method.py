@@ -20,12 +20,12 @@ frame = trial.frames[24:25]
 # ``likeness=None`` stops there. Leave both out for an accurate map.
 options = {
     "grad-cam": {},
-    "layer-cam": {},
     "integrated-gradients": {"steps": 16},
     "smooth-grad": {},
     "occlusion": {"tile_px": 28},
     "shapley": {"tile_px": 28},
     "poly-cam": {"budget": 0.05, "likeness": None},
+    "integrated-gradients-thesis": {},
     "grad-cam-thesis": {},
 }
 maps = {
