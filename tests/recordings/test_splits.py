@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from sliplens.errors import InputError
 from sliplens.recordings import Dataset, TrialFacts, check_dataset, load_dataset
 from sliplens.recordings.dataset import DATASET_FILE
-from sliplens.recordings.splits import SPLITS, Group, assign_splits, deal_splits, read_split_table, split_dataset
+from sliplens.recordings.splits import SPLITS, Group, assign_splits, read_split_table, split_by_group, split_dataset
 
 GROUPS = st.sampled_from(["trial", "object", "day"])
 
@@ -27,7 +27,7 @@ def singles(count: int) -> list[TrialFacts]:
 
 
 def dealt(trials: list[TrialFacts], by: Group = "trial", *, seed: int = 0) -> dict[str, str]:
-    return dict(zip((one.trial for one in trials), deal_splits(trials, by=by, seed=seed).splits, strict=True))
+    return dict(zip((one.trial for one in trials), split_by_group(trials, by=by, seed=seed).splits, strict=True))
 
 
 LAB = [
@@ -57,7 +57,7 @@ LAB = [
     ],
 )
 def test_shares_of_groups_by_hand(count: int, shares: tuple[float, float, float], expected: tuple[int, ...]):
-    counts = Counter(deal_splits(singles(count), by="trial", shares=shares).splits)
+    counts = Counter(split_by_group(singles(count), by="trial", shares=shares).splits)
     assert tuple(counts[name] for name in SPLITS) == expected
 
 
@@ -65,7 +65,7 @@ def test_shares_of_groups_by_hand(count: int, shares: tuple[float, float, float]
 def test_every_split_has_its_share_within_one_group(count: int, weights: tuple[int, int, int], seed: int):
     train, validation, test = (weight / sum(weights) for weight in weights)
     shares = (train, validation, test)
-    counts = Counter(deal_splits(singles(count), by="trial", shares=shares, seed=seed).splits)
+    counts = Counter(split_by_group(singles(count), by="trial", shares=shares, seed=seed).splits)
     assert sum(counts.values()) == count
     named = [(split, share) for split, share in zip(SPLITS, shares, strict=True) if share]
     assert {*counts} <= {split for split, _ in named}
@@ -100,7 +100,7 @@ def test_a_group_stays_whole_and_the_order_of_the_trials_does_not_matter(
     assert all(len(names) == 1 for names in of_group.values())
     shuffled = data.draw(st.permutations(trials))
     assert dealt(shuffled, by, seed=seed) == splits
-    assert set(deal_splits(shuffled, by=by).notes) == set(deal_splits(trials, by=by).notes)
+    assert set(split_by_group(shuffled, by=by).notes) == set(split_by_group(trials, by=by).notes)
 
 
 def table(folder: Path, text: str) -> Path:
@@ -123,7 +123,7 @@ def test_what_is_odd_is_noted():
         "day 3 in both train and test: the test does not show how well a new day is predicted",
     )
     some = [replace(LAB[0], object=""), *LAB[1:]]
-    assert "the object of cup-1 is unknown; dealt as one object" in deal_splits(some, by="object").notes
+    assert "the object of cup-1 is unknown; split as one object" in split_by_group(some, by="object").notes
 
 
 @pytest.mark.parametrize(
@@ -144,11 +144,11 @@ def test_a_table_that_is_none_is_refused_with_its_cure(tmp_path: Path, text: str
 def test_trials_that_cannot_be_dealt_are_refused_with_their_cure():
     with pytest.raises(InputError, match=r"cup-1, cup-2, walnut-1 and wallet-1; add rows, or a last row for \*"):
         assign_splits(LAB, {"egg-*": "test"})
-    with pytest.raises(InputError, match="the object of t0 and t1 is unknown; name it on import, or deal by trial"):
-        deal_splits(singles(2), by="object")
+    with pytest.raises(InputError, match="the object of t0 and t1 is unknown; name it on import, or split by trial"):
+        split_by_group(singles(2), by="object")
     for shares in ((0.5, 0.5, 0.5), (1.5, -0.5, 0.0), (float("nan"), 0.5, 0.5)):
         with pytest.raises(InputError, match="give three, none below 0, that sum to 1"):
-            deal_splits(LAB, by="trial", shares=shares)
+            split_by_group(LAB, by="trial", shares=shares)
 
 
 @pytest.fixture

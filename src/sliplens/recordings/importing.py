@@ -30,7 +30,7 @@ from sliplens.recordings.manifest import ManifestRow, find_rows
 from sliplens.recordings.options import LabelSettings, ReadOptions
 from sliplens.recordings.sensor import SensorProfile, is_profile, load_profile
 from sliplens.recordings.source import open_source
-from sliplens.recordings.splits import Group, SplitResult, assign_splits, deal_splits, load_splits
+from sliplens.recordings.splits import Group, SplitResult, assign_splits, load_splits, split_by_group
 from sliplens.recordings.store import decode_pixels, encode_pixels, forces_path, in_turn, save_forces, write_trial
 from sliplens.recordings.trial import label_by_friction, labels_of_margins
 from sliplens.runner import MakePart, Work, part, require_executor, run_parts
@@ -271,13 +271,13 @@ def import_recordings(
         Name of the sensor, or its profile (`SensorProfile`, its TOML file, the name of one that comes with sliplens),
         which prepares the frames and is stored with them.
     splits
-        Split of each trial, or a table of them (CSV), or `trial`, `object` or `day` to deal them; see `split_dataset`.
+        Split of each trial, a table of them (CSV), or `trial`, `object` or `day` to assign them: see `split_dataset`.
     reading
         Facts about the sources.
     labelling
         Facts about forces and friction.
     add
-        If True, add to the data set in `out`. Its trials stay, and so do their splits unless `splits` deals all of
+        If True, add to the data set in `out`. Its trials stay, and so do their splits unless `splits` assigns all of
         them.
     on
         Where trials are made, a row of `runner.EXECUTORS`: `serial` (several side by side in threads), `processes`,
@@ -322,7 +322,7 @@ def import_recordings(
         captures = [job.capture for job in jobs.values()]
         _require_names(captures, lost)
         plan = None if splits is None else load_splits(splits)
-        dealt = _deal(old, captures, plan, last)  # a mistake in the splits is found before anything slow
+        assigned = _assign(old, captures, plan, last)  # a mistake in the splits is found before anything slow
         config = {**work.recipe(), "splits": plan, "last_trials": last}
         config |= {} if before is None else {"added_to": before.hash}
         with output_folder(Path(out), stage="import", config=config, overwrite=overwrite or add) as output:
@@ -342,17 +342,17 @@ def import_recordings(
                 )
                 names = {info.trial for info in new}
                 written = [job for job in jobs.values() if job.capture.trial in names]
-                dealt = _deal(old, [job.capture for job in written], plan, last)
+                assigned = _assign(old, [job.capture for job in written], plan, last)
                 for used in {job.profile.name: job.profile for job in written if job.profile}.values():
                     dataset.save_profile(folder, used)
-                table = [replace(info, split=split) for info, split in zip([*old, *new], dealt.splits, strict=True)]
+                table = [replace(info, split=split) for info, split in zip([*old, *new], assigned.splits, strict=True)]
                 # trials left out before stay listed
                 missing = {trial.trial: trial for trial in (*(before.left_out if before else ()), *lost, *failed)}
                 missing = [trial for name, trial in missing.items() if name not in {info.trial for info in table}]
                 simulated = all(job.capture.simulated for job in written) and (before is None or before.simulated)
                 dataset.write_dataset_table(folder, table, simulated=simulated, left_out=missing)
                 remove(folder / PARTS)
-        for message in dealt.notes:
+        for message in assigned.notes:
             add_note(message)
         data = load_dataset(out)
         dataset.report_dataset(data, existed=output.complete)
@@ -492,16 +492,16 @@ def _require_names(captures: Sequence[Capture], left_out: Sequence[LeftOut] = ()
             raise InputError(f"{capture.source} does not name its sensor, and a network is of one; add --sensor")
 
 
-def _deal(
+def _assign(
     old: Sequence[TrialInfo],
     captures: Sequence[Capture],
     plan: Mapping[str, str] | Group | None,
     last: tuple[int | None, int | None],
 ) -> SplitResult:
-    """Deal the splits of all trials, the old ones first: by a plan, or the last new trials validate and test."""
+    """Assign the splits of all trials, the old ones first: by a plan, or the last new trials validate and test."""
     if plan is not None:
         trials = [*old, *captures]
-        return assign_splits(trials, plan) if isinstance(plan, Mapping) else deal_splits(trials, by=plan)
+        return assign_splits(trials, plan) if isinstance(plan, Mapping) else split_by_group(trials, by=plan)
     splits, (validation, test) = [capture.split or "train" for capture in captures], (number or 0 for number in last)
     if validation < 0 or test < 0:
         raise InputError(f"numbers of trials are not negative, got {validation} and {test}; give 0 or more")

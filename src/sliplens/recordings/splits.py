@@ -1,4 +1,4 @@
-"""Splits of a data set: whole trials dealt to train, validation and test, or assigned by a table."""
+"""Splits of a data set: whole trials assigned to train, validation and test, by group or by a table."""
 
 import hashlib
 import math
@@ -17,7 +17,7 @@ from sliplens.recordings.dataset import Dataset, load_dataset, write_dataset_tab
 from sliplens.recordings.manifest import read_csv
 from sliplens.recordings.trial import TrialFacts
 
-SPLITS = ("train", "validation", "test")  #: Splits that trials are dealt to.
+SPLITS = ("train", "validation", "test")  #: Splits that trials are assigned to.
 Group: TypeAlias = Literal["trial", "object", "day"]  #: Facts by which trials are grouped.
 _SPLIT_NAME = re.compile(r"[a-z][a-z0-9_-]*")
 # shares are written with few digits: thirds as 0.3333 should be corrected by whoever wrote them
@@ -69,32 +69,32 @@ def assign_splits(trials: Sequence[TrialFacts], table: Mapping[str, str]) -> Spl
     return SplitResult(splits=splits, notes=(*notes, *_remarks(trials, splits)))
 
 
-def deal_splits(
+def split_by_group(
     trials: Sequence[TrialFacts], *, by: Group, shares: tuple[float, float, float] = (0.7, 0.15, 0.15), seed: int = 0
 ) -> SplitResult:
-    """Deal trials to train, validation and test, keeping trials of one group together.
+    """Assign trials to train, validation and test, keeping trials of one group together.
 
     Each split gets its share of the groups by the method of largest remainders; a split without a group takes one from
-    the split with most beyond its share, as long as there are groups enough. Groups are dealt in the order of the
+    the split with most beyond its share, as long as there are groups enough. Groups are assigned in the order of the
     SHA-256 of `SEED:GROUP`: independent of the order and number of trials, so that a new group moves few others.
 
     Examples
     --------
-    >>> from sliplens.recordings.splits import TrialFacts, deal_splits
+    >>> from sliplens.recordings.splits import TrialFacts, split_by_group
     >>> trials = [TrialFacts(trial=f"{cup}-{i}", object=cup) for cup in ("mug", "jar", "can") for i in (1, 2)]
-    >>> splits = deal_splits(trials, by="object").splits
+    >>> splits = split_by_group(trials, by="object").splits
     >>> splits[::2] == splits[1::2], sorted(splits[::2])
     (True, ['test', 'train', 'validation'])
     """
     names = [trial.trial for trial in trials]
     if by not in get_args(Group):
-        raise InputError(f"trials cannot be dealt by {by!r}; choose {', '.join(get_args(Group))}")
+        raise InputError(f"trials cannot be split by {by!r}; choose {', '.join(get_args(Group))}")
     if any(not (math.isfinite(share) and share >= 0) for share in shares) or abs(sum(shares) - 1) > _SUM_TOLERANCE:
         raise InputError(f"the shares are {', '.join(map(str, shares))}; give three, none below 0, that sum to 1")
     group_of = [str(getattr(trial, by)) for trial in trials]
     unknown = sorted(name for name, group in zip(names, group_of, strict=True) if not group)
     if len(unknown) == len(trials):
-        raise InputError(f"the {by} of {_list(unknown)} is unknown; name it on import, or deal by trial")
+        raise InputError(f"the {by} of {_list(unknown)} is unknown; name it on import, or split by trial")
     groups = sorted(set(group_of), key=lambda name: hashlib.sha256(f"{seed}:{name}".encode()).digest())
     # the decimals as they were written: 0.15 of 20 is 3, with no rounding error to decide a tie
     parts = {split: Fraction(repr(share)) for split, share in zip(SPLITS, shares, strict=True) if share}
@@ -108,7 +108,7 @@ def deal_splits(
         counts[max((each for each in counts if counts[each] > 1), key=lambda each: counts[each] - exact[each])] -= 1
     split_of = dict(zip(groups, (split for split in counts for _ in range(counts[split])), strict=True))
     splits = tuple(split_of[group] for group in group_of)
-    notes = [f"the {by} of {_list(unknown)} is unknown; dealt as one {by}"] if unknown else []
+    notes = [f"the {by} of {_list(unknown)} is unknown; split as one {by}"] if unknown else []
     return SplitResult(splits=splits, notes=(*notes, *_remarks(trials, splits)))
 
 
@@ -126,19 +126,19 @@ def split_dataset(
     seed: int = 0,
     dry_run: bool = False,
 ) -> SplitResult:
-    """Deal the trials of a data set to train, validation and test; only the splits in its table change.
+    """Assign the trials of a data set to train, validation and test; only the splits in its table change.
 
     Parameters
     ----------
     data
         Data set, or its folder.
     splits
-        `trial`, `object` or `day`: trials that agree in it stay together (`deal_splits`). Or the split of each trial by
-        its name, or a table of them (CSV, `read_split_table`).
+        `trial`, `object` or `day`: trials that agree in it stay together (`split_by_group`). Or the split of each trial
+        by its name, or a table of them (CSV, `read_split_table`).
     shares
         Parts of the groups that train, validate and test.
     seed
-        Seed of the order in which groups are dealt.
+        Seed of the order in which groups are assigned.
     dry_run
         If True, nothing is written.
 
@@ -158,7 +158,7 @@ def split_dataset(
     if isinstance(splits, Mapping):
         result = assign_splits(data.trials, splits)
     else:
-        result = deal_splits(data.trials, by=splits, shares=shares, seed=seed)
+        result = split_by_group(data.trials, by=splits, shares=shares, seed=seed)
     if not dry_run:
         trials = [replace(info, split=split) for info, split in zip(data.trials, result.splits, strict=True)]
         write_dataset_table(data.folder, trials, simulated=data.simulated, left_out=data.left_out)

@@ -27,7 +27,7 @@ class SimulationRecipe:
 
     The days and splits follow the thesis: the first day and three quarters of the dry trials of the days between train,
     the other quarter validates, evenly spaced over these days, and the test day tests. Wet trials are all of the test
-    day, or dealt to the test days. A number out of range, or too few trials to fill every split, is an `InputError`.
+    day, or assigned to the test days. A number out of range, or too few trials to fill every split, is an `InputError`.
     """
 
     dry_trials: int | tuple[int, ...] = 40
@@ -290,15 +290,15 @@ def _spread(trials: int, *, days: int, tested: range) -> dict[int, int]:
     """Deal dry trials to the days in turn, to the first and a test day first so that no split is empty."""
     between = [day for day in range(2, days + 1) if day not in tested]
     order = [1, tested[-1], *between, *tested[:-1]]
-    dealt = dict.fromkeys(order, 0)
+    counts = dict.fromkeys(order, 0)
     for index in range(trials):
-        dealt[order[index % len(order)]] += 1
+        counts[order[index % len(order)]] += 1
     if not between:
         # the first day has to feed two splits
-        while dealt[1] < 2:
-            dealt[tested[-1]] -= 1
-            dealt[1] += 1
-    return dealt
+        while counts[1] < 2:
+            counts[tested[-1]] -= 1
+            counts[1] += 1
+    return counts
 
 
 def _seed(recipe: SimulationRecipe, *branch: int) -> int:
