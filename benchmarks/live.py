@@ -6,8 +6,8 @@
     python benchmarks/live.py --ratios --json       # one network over another, in two minutes
 
 `p50_ms` and `p99_ms` are from the moment a replayed frame is due to its margin, over the frames that have one, while a
-headless Chromium beside it draws the page (`--page browser`); `p50_first_ms` and `p99_first_ms` are to its first event,
-before markers, slip, focus, light, camera and direction are checked; `p99_ms_with_maps` is the same while the page
+headless Chromium beside it draws the page (`--page browser`); with `--early` `p50_first_ms` and `p99_first_ms` are to
+the early margin, and the complete reading comes later than without; `p99_ms_with_maps` is the same while the page
 shows maps, twice a second. `drops` are frames that were never read, `memory_growth_mb` how much more memory the process
 holds at the end than after the first 10 seconds (or a tenth of a shorter run), `page_ms_a_second` the processor time of
 the page's threads. `of_it_ms` is the mean time of each part over the slowest hundredth of the frames: `network` is what
@@ -105,7 +105,7 @@ def repeat_frames(frames: np.ndarray, *, seconds: float) -> ReplaySource:
 
 
 def measure(
-    frames: np.ndarray, untouched: np.ndarray, *, network: Network, seconds: float, shown: bool, maps: bool
+    frames: np.ndarray, untouched: np.ndarray, *, network: Network, seconds: float, shown: bool, maps: bool, early: bool
 ) -> dict[str, object]:
     """Read a repeated grip for a while, with a page or without, and maps on it or not."""
     network = replace(network, manifest=replace(network.manifest, frame_size=SIZE))
@@ -145,7 +145,7 @@ def measure(
             memory_mb[since_s] = resident_mb()
 
     reader = sl.LiveReader(source, network, reference=untouched)  # for hours, as far as it knows
-    reader.subscribe(keep, early=True)
+    reader.subscribe(keep, early=early)
     pictures, explained, spent_s = set[int](), set[int](), 0.0
     with ExitStack() as stack:
         stack.enter_context(reader)
@@ -285,10 +285,10 @@ def compare_ways(frames: np.ndarray, untouched: np.ndarray, *, rounds: int) -> d
 
 
 def measure_pace(
-    frames: np.ndarray, untouched: np.ndarray, *, network: Network, seconds: float, shown: bool
+    frames: np.ndarray, untouched: np.ndarray, *, network: Network, seconds: float, shown: bool, early: bool
 ) -> dict[str, object]:
     """Measure latencies at the camera's pace, with a page open or not, and with maps on it."""
-    measured = partial(measure, frames, untouched, network=network, shown=shown)
+    measured = partial(measure, frames, untouched, network=network, shown=shown, early=early)
     found = {**measured(seconds=seconds, maps=False), "seconds": seconds}
     if shown:
         beside = measured(seconds=max(5.0, seconds / 10), maps=True)
@@ -303,6 +303,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=10.0, help="length of the run without maps")
     parser.add_argument("--network", default=DEFAULT_NETWORK, help="name or folder of a network, but for --ratios")
     parser.add_argument("--page", choices=("browser", "none"), default="browser", help="what looks at the page")
+    parser.add_argument("--early", action="store_true", help="ask for early margins too")
     parser.add_argument("--ratios", action="store_true", help="compare ways to read in place of that")
     parser.add_argument("--rounds", type=int, default=1200, help="frames that each way reads, for --ratios")
     parser.add_argument("--json", action="store_true", help="print one line of JSON")
@@ -312,7 +313,9 @@ def main() -> None:
         result = compare_ways(frames, untouched, rounds=options.rounds)
     else:
         network, shown = sl.load(options.network), options.page == "browser"
-        result = measure_pace(frames, untouched, network=network, seconds=60 * options.minutes, shown=shown)
+        result = measure_pace(
+            frames, untouched, network=network, seconds=60 * options.minutes, shown=shown, early=options.early
+        )
     result["load"] = round(os.getloadavg()[0], 1)
     print(json.dumps(result, indent=None if options.json else 2))
 
