@@ -6,8 +6,7 @@
     python benchmarks/live.py --ratios --json       # one network over another, in two minutes
 
 `p50_ms` and `p99_ms` are from the moment a replayed frame is due to its margin, over the frames that have one, while a
-headless Chromium beside it draws the page (`--page browser`); with `--early` `p50_first_ms` and `p99_first_ms` are to
-the early margin, and the complete reading comes later than without; `p99_ms_with_maps` is the same while the page
+headless Chromium beside it draws the page (`--page browser`); `p99_ms_with_maps` is the same while the page
 shows maps, twice a second. `drops` are frames that were never read, `memory_growth_mb` how much more memory the process
 holds at the end than after the first 10 seconds (or a tenth of a shorter run), `page_ms_a_second` the processor time of
 the page's threads. `of_it_ms` is the mean time of each part over the slowest hundredth of the frames: `network` is what
@@ -105,21 +104,18 @@ def repeat_frames(frames: np.ndarray, *, seconds: float) -> ReplaySource:
 
 
 def measure(
-    frames: np.ndarray, untouched: np.ndarray, *, network: Network, seconds: float, shown: bool, maps: bool, early: bool
+    frames: np.ndarray, untouched: np.ndarray, *, network: Network, seconds: float, shown: bool, maps: bool
 ) -> dict[str, object]:
     """Read a repeated grip for a while, with a page or without, and maps on it or not."""
     network = replace(network, manifest=replace(network.manifest, frame_size=SIZE))
     source = repeat_frames(frames, seconds=seconds + OPENS_S + 60)
     # made beforehand, so that what is kept here does not look like memory that grows
-    table = np.full((round(1.1 * RATE_HZ * seconds) + 600, 3 + len(PARTS)), -1.0)
-    kept, last, begins_s, first_ms = [0], [""], [np.inf], [np.inf]
+    table = np.full((round(1.1 * RATE_HZ * seconds) + 600, 2 + len(PARTS)), -1.0)
+    kept, last, begins_s = [0], [""], [np.inf]
     memory_mb = np.full(round(seconds) + 10, -1.0)
     dropped, settles_s = [0, 0], min(10.0, seconds / 10)
 
     def keep(reading: Reading, frame: LiveFrame | None) -> None:
-        if not reading.complete:
-            first_ms[0] = reading.latency.total_ms
-            return
         if frame is None or reading.time_s < begins_s[0]:
             dropped[0] = reading.dropped
             return
@@ -132,11 +128,9 @@ def measure(
         table[kept[0]] = (
             reading.margin is not None,
             spent.total_ms,
-            min(spent.total_ms, *first_ms),
             waiting_ms,
             *own_ms,
         )
-        first_ms[0] = np.inf
         kept[0] += 1
         last[0] = str(reading.withheld)
         dropped[1] = reading.dropped
@@ -145,7 +139,7 @@ def measure(
             memory_mb[since_s] = resident_mb()
 
     reader = sl.LiveReader(source, network, reference=untouched)  # for hours, as far as it knows
-    reader.subscribe(keep, early=early)
+    reader.subscribe(keep)
     pictures, explained, spent_s = set[int](), set[int](), 0.0
     with ExitStack() as stack:
         stack.enter_context(reader)
@@ -173,10 +167,7 @@ def measure(
         raise SystemExit(f"no frame had a margin, so there is nothing to measure; the last: {last[0]}")
     memory_mb = memory_mb[memory_mb >= 0]
     return {
-        **summarise(rows[:, 0], rows[:, 2:]),
-        **dict(
-            zip(("p50_first_ms", "p99_first_ms"), np.quantile(rows[:, 1], (0.5, 0.99)).round(2).tolist(), strict=True)
-        ),
+        **summarise(rows[:, 0], rows[:, 1:]),
         "drops": dropped[1] - dropped[0],
         "memory_growth_mb": round(float(memory_mb[-1] - memory_mb[0]), 1) if len(memory_mb) else 0.0,
         "readings": kept[0],
@@ -285,10 +276,10 @@ def compare_ways(frames: np.ndarray, untouched: np.ndarray, *, rounds: int) -> d
 
 
 def measure_pace(
-    frames: np.ndarray, untouched: np.ndarray, *, network: Network, seconds: float, shown: bool, early: bool
+    frames: np.ndarray, untouched: np.ndarray, *, network: Network, seconds: float, shown: bool
 ) -> dict[str, object]:
     """Measure latencies at the camera's pace, with a page open or not, and with maps on it."""
-    measured = partial(measure, frames, untouched, network=network, shown=shown, early=early)
+    measured = partial(measure, frames, untouched, network=network, shown=shown)
     found = {**measured(seconds=seconds, maps=False), "seconds": seconds}
     if shown:
         beside = measured(seconds=max(5.0, seconds / 10), maps=True)
@@ -303,7 +294,6 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=10.0, help="length of the run without maps")
     parser.add_argument("--network", default=DEFAULT_NETWORK, help="name or folder of a network, but for --ratios")
     parser.add_argument("--page", choices=("browser", "none"), default="browser", help="what looks at the page")
-    parser.add_argument("--early", action="store_true", help="ask for early margins too")
     parser.add_argument("--ratios", action="store_true", help="compare ways to read in place of that")
     parser.add_argument("--rounds", type=int, default=1200, help="frames that each way reads, for --ratios")
     parser.add_argument("--json", action="store_true", help="print one line of JSON")
@@ -313,9 +303,7 @@ def main() -> None:
         result = compare_ways(frames, untouched, rounds=options.rounds)
     else:
         network, shown = sl.load(options.network), options.page == "browser"
-        result = measure_pace(
-            frames, untouched, network=network, seconds=60 * options.minutes, shown=shown, early=options.early
-        )
+        result = measure_pace(frames, untouched, network=network, seconds=60 * options.minutes, shown=shown)
     result["load"] = round(os.getloadavg()[0], 1)
     print(json.dumps(result, indent=None if options.json else 2))
 

@@ -26,7 +26,7 @@ def read(one: int, told: dict[str, Any], **more: object) -> int:
 def _read() -> dict[str, object]: ...
 '''
 ALLOWED = {
-    "lines": 35_951,
+    "lines": 35_902,
     "modules": 148,
     "riddles_per_1000": 0.25,
     "vague_docstrings": 0,

@@ -229,35 +229,6 @@ def test_every_margin_has_the_novelty_of_its_very_frame(trials: dict[str, Record
         assert check.value == pytest.approx(-np.log10(share), abs=1e-2)
 
 
-def test_a_margin_comes_first_and_the_complete_reading_of_its_frame_confirms_or_withholds_it(
-    trials: dict[str, Recording], rng: np.random.Generator
-):
-    trial = trials["chromatouch"]
-    image = trial.frames[np.flatnonzero(np.isfinite(trial.safety_margin))[10]]
-    blurred = cv2.GaussianBlur(image, (0, 0), 4)
-    frames = np.stack([*[image] * 5, blurred, *[image] * 3]) + rng.normal(0, 2, (9, *image.shape))
-    source, events = Patient(np.clip(np.round(frames), 0, 255).astype(np.uint8)), list[Reading]()
-    reader = sl.LiveReader(source, "chromatouch-pair", reference=trial.reference, engine="torch", stall_s=10.0)
-    reader.subscribe(lambda reading, _: events.append(reading), early=True)
-    complete = source.all_readings(reader)
-    assert source.acted == complete  # a gripper acts on no margin that is not confirmed
-    early = {reading.number: reading for reading in events if not reading.complete}
-    assert [reading for reading in events if reading.complete] == complete
-    withheld = {reading.number for reading in complete if reading.margin is None}
-    assert {5} <= withheld <= {5, 6}  # the focus is measured in every second frame
-    # after a withheld one, the next waits for all its checks
-    assert early.keys() - {5} == {number for number in range(1, 9) if number - 1 not in withheld} - {5}
-    for number, first in early.items():
-        assert events[events.index(first) + 1] is complete[number]
-        ages_s = {check.name: check.age_s for check in first.health}
-        assert ages_s["novelty"] == ages_s["exposure"] == ages_s["repeated"] == ages_s["touch"] == 0
-        assert ages_s["markers"] == ages_s["direction"] == pytest.approx(0.05)
-        assert {check.name for check in first.health} == {
-            check.name for check in complete[number].health
-        } or number == 5
-        assert complete[number].margin in {first.margin, None}
-
-
 def test_markers_are_followed_for_whoever_tells_slip(trials: dict[str, Recording]):
     trial, source = trials["chromatouch"], Patient(trials["chromatouch"].frames[:1])
     sticks = watch(lambda _: MarkerReading(state=SlipState.STICKING))

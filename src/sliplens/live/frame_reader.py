@@ -180,12 +180,8 @@ class FrameReader:
         parts = {"number": last.number, "time_s": last.time_s, "captured_s": last.captured_s}
         return Reading(**parts, withheld=why, dropped=self._dropped)
 
-    def read(self, frame: LiveFrame, *, early: Callable[[Reading], None] | None = None) -> Reading:
-        """Read the next frame.
-
-        Where the frame before had a margin, `early` is called first with that of this one, if its cheap checks and its
-        novelty pass: that reading is not `complete`.
-        """
+    def read(self, frame: LiveFrame) -> Reading:
+        """Read the next frame."""
         require_rgb(frame.image, what=f"levels of frame {frame.number} of {self.source.name}")
         last = self._last
         self._dropped += 0 if last is None else max(0, frame.number - last.number - 1)
@@ -198,34 +194,27 @@ class FrameReader:
             latency=Latency(decode_ms=frame.decode_ms),
         )
         why = self._unready(last, frame)
-        self._last = _timed(self._read(begin, frame, early) if why is None else replace(begin, withheld=why))
+        self._last = _timed(self._read(begin, frame) if why is None else replace(begin, withheld=why))
         return self._last
 
-    def _read(self, begin: Reading, frame: LiveFrame, early: Callable[[Reading], None] | None) -> Reading:
+    def _read(self, begin: Reading, frame: LiveFrame) -> Reading:
         """Read a frame that can be compared with the reference."""
-        last, network = self._last, self.network
+        network = self.network
         if network is None or self.engine is None or self.reference is None:
             return self._check(begin, frame)
-        # the head for several frames predicts each once, after all checks
-        is_early = early is not None and last is not None and last.margin is not None and self._follower is None
         checked, begun = list[Reading](), time.perf_counter()
         inputs = network.encode(frame.image[None], self.reference)
         encoded = time.perf_counter()
 
         def batches() -> Iterator[Tensor]:
             yield inputs  # the batch is under way: an engine looks for the next one first
-            checked.append(self._check_now(begin, frame) if is_early else self._check(begin, frame))
+            checked.append(self._check(begin, frame))
 
         [parts] = self.engine.answers(batches())
         [reading] = checked
         network_ms = 1e3 * (time.perf_counter() - encoded) - reading.latency.checks_ms
         latency = replace(reading.latency, encode_ms=1e3 * (encoded - begun), network_ms=network_ms)
-        reading = self._estimate(replace(reading, latency=latency), frame, network, parts)
-        if is_early:
-            if early is not None and reading.margin is not None and reading.health[-1].name == "novelty":
-                early(_timed(reading))
-            reading = self._estimate(self._check(replace(begin, latency=latency), frame), frame, network, parts)
-        return reading
+        return self._estimate(replace(reading, latency=latency), frame, network, parts)
 
     def _unready(self, last: Reading | None, frame: LiveFrame) -> str | None:
         """Explain why a frame cannot be compared with a reference, after taking a new one where that is due."""
@@ -246,17 +235,6 @@ class FrameReader:
             return "there is no reference frame yet; the picture must be still for a moment: leave the sensor untouched"
         return None
 
-    def _check_now(self, begin: Reading, frame: LiveFrame) -> Reading:
-        """Make the cheap checks of a frame; all else in its reading is of the frame before."""
-        begun, last = time.perf_counter(), self._last
-        health = () if self._health is None else self._health.check_now(frame)
-        if last is not None:
-            age_s = frame.time_s - last.time_s
-            health += tuple(replace(check, age_s=age_s) for check in last.health if check.name == "direction")
-            begin = replace(begin, slip=last.slip, markers=last.markers)
-        latency = replace(begin.latency, checks_ms=1e3 * (time.perf_counter() - begun))
-        return replace(begin, health=health, withheld=_first_fault(health), complete=False, latency=latency)
-
     def _check(self, begin: Reading, frame: LiveFrame) -> Reading:
         """Track the markers of a frame and check its health; returns its reading without the margin."""
         begun = time.perf_counter()
@@ -269,8 +247,7 @@ class FrameReader:
         health = () if self._health is None else self._health.check(frame, tracked)
         if self._shear is not None and self.network is not None and all(check.ok for check in health):
             health = (*health, check_direction(self.network, self._shear.estimate(frame.image)))
-        checks_ms = begin.latency.checks_ms + 1e3 * (time.perf_counter() - begun)
-        latency = replace(begin.latency, checks_ms=checks_ms)
+        latency = replace(begin.latency, checks_ms=1e3 * (time.perf_counter() - begun))
         withheld, slip = _first_fault(health), markers and markers.state
         reading = replace(begin, slip=slip, markers=markers, health=health, withheld=withheld, latency=latency)
         untouched = any(check.name == "touch" and not check.ok for check in health)
@@ -299,7 +276,7 @@ class FrameReader:
         if follower is not None:
             estimate = follower.update(estimate, np.array([frame.time_s]), np.array([True]))
         ratio = None if estimate.ratio is None else float(estimate.ratio.mean[0])
-        if ratio is not None and estimate.ratio is not None and reading.complete:
+        if ratio is not None and estimate.ratio is not None:
             self.learner.note(ratio, sigma=float(estimate.ratio.sigma[0]), time_s=frame.time_s)
         interval = estimate.interval(LEVEL)
         values = np.concatenate([estimate.margin] if interval is None else [estimate.margin, *interval]).clip(0, 1)

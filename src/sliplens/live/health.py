@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -66,7 +66,6 @@ class HealthMonitor:
         self._numbers: deque[tuple[float, int]] = deque()
         self._last: dict[str, tuple[float, Check]] = {}
         """Time and result of each check when it was made last."""
-        self._frame: LiveFrame | None = None
         self._markers: Tracks | None = None
 
     def check(self, frame: LiveFrame, markers: Tracks | None = None, /) -> tuple[Check, ...]:
@@ -74,18 +73,7 @@ class HealthMonitor:
 
         The first check that fails names the cause: faults of the camera come before what they change in the picture.
         """
-        if self._frame is not frame:
-            self.check_now(frame)
-        self._markers = markers
-        slow = _SLOW if markers is None else _SLOW[:2]  # markers show the camera's motion at once, the border slowly
-        age_s = {name: frame.time_s - self._last[name][0] if name in self._last else np.inf for name in slow}
-        # too old ones are due, else the oldest; at the same time it may be another frame, of a source without a clock
-        due = [name for name in slow if not 0 < age_s[name] < _OLDEST_S] or [max(slow, key=lambda name: age_s[name])]
-        return self._make([name for name in _LATER if name not in slow or name in due], frame)
-
-    def check_now(self, frame: LiveFrame, /) -> tuple[Check, ...]:
-        """Make the checks that take less than a millisecond; the others are those of earlier frames, with their age."""
-        self._frame, soft = frame, soften(frame.small)
+        self._markers, soft = markers, soften(frame.small)
         # pixels that are neither dark nor saturated in either picture
         both = (self._soft > _DIM) & (soft > _DIM) & (self._soft < _WHITE) & (soft < _WHITE)
         ratio = np.log2(np.where(both, soft, 1) / np.where(both, self._soft, 1))
@@ -94,11 +82,11 @@ class HealthMonitor:
         self._brighter = np.where(both, ratio - self._gain, np.inf)
         self._change = picture_change(soft * 2**-self._gain, self._soft)
         self._stillness.update(block_means(_green(frame.small), _BLOCK_PX), frame.forces)
-        return self._make([name for name in CHECKS if name not in _LATER], frame)
-
-    def _make(self, names: Sequence[str], frame: LiveFrame) -> tuple[Check, ...]:
-        """Make some checks; returns the newest of each."""
-        for name in names:
+        slow = _SLOW if markers is None else _SLOW[:2]  # markers show the camera's motion at once, the border slowly
+        age_s = {name: frame.time_s - self._last[name][0] if name in self._last else np.inf for name in slow}
+        # too old ones are due, else the oldest; at the same time it may be another frame, of a source without a clock
+        due = [name for name in slow if not 0 < age_s[name] < _OLDEST_S] or [max(slow, key=lambda name: age_s[name])]
+        for name in (name for name in CHECKS if name not in slow or name in due):
             measure = CHECKS[name].measure
             self._last.pop(name, None)
             if measure is not None and (measured := measure(self, frame)) is not None:
@@ -263,8 +251,6 @@ time are chosen by hand. `harm` was fitted by `benchmarks/health.py --choose --t
 show no touch, whose growth is of an earlier fit to twice as many trials.
 """
 _SLOW = "focus", "light", "camera"
-_LATER = *_SLOW, "markers"
-"""Checks that `check_now` leaves out."""
 
 
 class _Stillness:

@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from threading import Condition, Event, Lock, Thread
 from typing import TypeAlias, Unpack
@@ -156,8 +155,7 @@ class LiveReader(FrameReader):
         self._news = Condition()
         self._newest: Reading | None = None
         self._published = 0
-        self._subscribers: dict[Subscriber, bool] = {}
-        """Callbacks, and whether they take early margins."""
+        self._subscribers: dict[Subscriber, None] = {}
         self._stopped, self._over = Event(), Event()
         self._error: BaseException | None = None
         self._trouble: str | None = None
@@ -273,14 +271,12 @@ class LiveReader(FrameReader):
         if self._error is not None:
             raise self._error
 
-    def subscribe(self, callback: Subscriber, *, early: bool = False) -> Callable[[], object]:
+    def subscribe(self, callback: Subscriber) -> Callable[[], object]:
         """Call back with every reading and its frame; returns a function that ends it.
 
-        With `early`, a margin comes some milliseconds before the complete reading of its frame, in one more reading
-        (`Reading.complete`): it may still be withheld, so never loosen a grip by it. The callback runs in the thread
-        that reads, which waits for it: do long work elsewhere.
+        The callback runs in the thread that reads, which waits for it: do long work elsewhere.
         """
-        self._subscribers[callback] = early
+        self._subscribers[callback] = None
         return lambda: self._subscribers.pop(callback, None)
 
     @property
@@ -396,8 +392,7 @@ class LiveReader(FrameReader):
         while (left_s := ends_s - time.monotonic()) > 0:
             frame = self._frames.take(min(self._stall_s, left_s))
             if frame is not None:
-                early = partial(self._call_back, frame) if any(self._subscribers.values()) else None
-                self._publish(self.read(frame, early=early), frame)
+                self._publish(self.read(frame), frame)
             elif self._frames.closed:
                 break
             elif time.monotonic() < ends_s:
@@ -414,12 +409,8 @@ class LiveReader(FrameReader):
         with self._news:
             self._newest, self._published = reading, self._published + 1
             self._news.notify_all()
-        self._call_back(frame, reading)
-
-    def _call_back(self, frame: LiveFrame | None, reading: Reading) -> None:
-        for callback, early in tuple(self._subscribers.items()):
-            if early or reading.complete:
-                callback(reading, frame)
+        for callback in tuple(self._subscribers):
+            callback(reading, frame)
 
 
 def read_live(

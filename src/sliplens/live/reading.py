@@ -160,9 +160,6 @@ class Reading:
     """Reading of the markers; None where they are not tracked."""
     health: tuple[Check, ...] = ()
     """Checks of the frame; empty without a health monitor."""
-    complete: bool = True
-    """False of a margin that comes first: markers, slip, focus, light, camera and direction are those of the frame
-    before, and a complete reading of the same number follows, which may withhold it."""
     withheld: str | None = None
     """Why there is no margin, with the cure; None where there is one, or no network."""
     latency: Latency = Latency()
