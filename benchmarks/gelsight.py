@@ -10,9 +10,6 @@ training, as if as many slipped as held in either part: knowing which part a cli
 
 Objects are left out one at a time (for the network in folds); 95 % intervals are over objects. `grasps` joins both
 fingers, as do the figures at the top.
-
-Rest jitter is measured over runs of three and more key frames that differ by no more than the noise of the camera (0.9
-to 1.5 grey levels): between key frames the video copies what does not change.
 """
 
 import argparse
@@ -21,19 +18,18 @@ import os
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from itertools import islice, pairwise
+from itertools import islice
 from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # must be set before torch is imported
 
-import av
 import numpy as np
 import torch
 from rich.console import Console
 from rich.progress import track
-from scipy.optimize import minimize
-from scipy.special import expit
 from scipy.stats import spearmanr
+from sklearn.linear_model import LogisticRegression
+from sklearn.preprocessing import StandardScaler
 from torch import Tensor, nn
 
 from sliplens.errors import SliplensError
@@ -48,9 +44,6 @@ from sliplens.recordings.options import ReadOptions
 FRAMES, STRIDE = 24, 12
 SMALL = (48, 64)
 """Height and width of the pictures that the network sees."""
-NOISE_LEVELS = 1.5
-"""Mean absolute difference between key frames, in grey levels, up to which they are still."""
-_STILL_KEYS = 3
 _CONTACT_PX = 1.0
 _RIDGE = 1.0
 _DRAWS = 2000
@@ -75,8 +68,6 @@ class Clip:
     """(frames, markers)"""
     picture: np.ndarray
     """(frames, rows, columns), grey and small, 8 bits."""
-    key_change: np.ndarray
-    """(frames,), mean absolute difference of a key frame from the one before, in grey levels; NaN for other frames."""
 
     def __len__(self) -> int:
         """Count the frames."""
@@ -179,7 +170,6 @@ def follow(recorded: RecordedClip) -> Clip:
         position_px=np.where(tracks.followed[..., None], tracks.position_px, np.nan),
         status=tracks.status,
         picture=np.stack([shrink(frame) for frame in frames]),
-        key_change=measure_key_change(path, frames, skipped=recorded.stale),
     )
 
 
@@ -187,16 +177,6 @@ def shrink(frame: np.ndarray) -> np.ndarray:
     """Grey and small."""
     cv2 = import_cv2()
     return cv2.resize(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), SMALL[::-1], interpolation=cv2.INTER_AREA)
-
-
-def measure_key_change(path: Path, frames: list[np.ndarray], *, skipped: int) -> np.ndarray:
-    """How far each key frame differs from the one before; NaN for the others, and for the first."""
-    with av.open(str(path)) as container:
-        keys = np.flatnonzero([frame.key_frame for frame in container.decode(video=0)][skipped:])
-    change = np.full(len(frames), np.nan)
-    for before, after in pairwise(keys):
-        change[after] = np.abs(frames[after].astype(np.float32) - frames[before]).mean()
-    return change
 
 
 def follow_all(folder: Path, keep: Path | None) -> tuple[list[Clip], list[str]]:
@@ -228,41 +208,6 @@ def alive_at_end(clip: Clip) -> float:
     last = int(touched[-1]) if len(touched) else len(far) - 1
     followed, seen = clip.status[last] == MarkerStatus.FOLLOWED, clip.status[last] != MarkerStatus.OUTSIDE
     return float(followed.sum() / max(1, seen.sum()))
-
-
-def find_still(clip: Clip) -> list[np.ndarray]:
-    """Runs of key frames in which the picture does not change by more than the camera's noise."""
-    keys = np.flatnonzero(np.isfinite(clip.key_change))
-    runs: list[list[int]] = []
-    for before, key in zip([-1, *keys[:-1]], keys, strict=True):
-        if clip.key_change[key] > NOISE_LEVELS:
-            continue
-        if runs and runs[-1][-1] == before:
-            runs[-1].append(int(key))
-        elif before >= 0:
-            # still against the one before, which may itself have moved: a run begins there
-            runs.append([int(before), int(key)])
-    return [np.array(run) for run in runs if len(run) >= _STILL_KEYS]
-
-
-def rest_jitter(clip: Clip) -> tuple[float, int]:
-    """Sum of squares of how far dots lie from their mean place over still runs, and its degrees of freedom."""
-    total, freedom = 0.0, 0
-    for run in find_still(clip):
-        places = clip.position_px[run]
-        kept = places[:, np.all(np.isfinite(places), axis=(0, 2))]
-        total += float(((kept - kept.mean(axis=0)) ** 2).sum())
-        freedom += 2 * (len(run) - 1) * kept.shape[1]
-    return total, freedom
-
-
-def measure_jitter(clips: list[Clip]) -> dict[str, object]:
-    """Root mean square of what dots move by on still frames, in pixels a coordinate."""
-    squares, freedoms = np.array([rest_jitter(clip) for clip in clips]).T
-    return {
-        "jitter_px": float(np.sqrt(squares.sum() / freedoms.sum())),
-        "jitter_key_frames": sum(len(run) for clip in clips for run in find_still(clip)),
-    }
 
 
 def window_starts(frames: int) -> np.ndarray:
@@ -357,18 +302,11 @@ def balanced_weights(labels: np.ndarray, full: np.ndarray) -> np.ndarray:
 
 
 def fit_logistic(values: np.ndarray, labels: np.ndarray, weight: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Ridge logistic regression; gives the probability of a slip."""
-    middle, scale = values.mean(axis=0), values.std(axis=0) + 1e-9
-    terms = np.concatenate([np.ones((len(values), 1)), (values - middle) / scale], axis=1)
-    ridge = np.append(1e-6, np.full(values.shape[1], _RIDGE))
-
-    def loss(at: np.ndarray) -> tuple[float, np.ndarray]:
-        score = terms @ at
-        slope = terms.T @ (weight * (expit(score) - labels)) + ridge * at
-        return float(weight @ (np.logaddexp(0, score) - labels * score) + ridge @ at**2 / 2), slope
-
-    at = minimize(loss, np.zeros(terms.shape[1]), jac=True, method="L-BFGS-B", tol=1e-14).x
-    return lambda others: expit(at[0] + np.clip((others - middle) / scale, -6, 6) @ at[1:])
+    """Ridge logistic regression; returns the function that gives the probability of a slip."""
+    scale = StandardScaler().fit(values)
+    fitted = LogisticRegression(C=1 / _RIDGE, tol=1e-8, max_iter=1000)
+    fitted.fit(scale.transform(values), labels, sample_weight=weight)
+    return lambda others: fitted.predict_proba(np.clip(scale.transform(others), -6, 6))[:, 1]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -615,7 +553,6 @@ def main() -> None:
         "frames": sum(len(clip) for clip in clips),
         "tracks_alive": float(alive.mean()),
         "worst_clip_alive": float(alive.min()),
-        **measure_jitter(clips),
         **measure_classifiers(clips, seeds=options.seeds),
     }
     grasps, by_count = found["grasps"], found["grasps_by_frame_count"]
