@@ -184,7 +184,7 @@ def r2_over_days(name: str, truth: np.ndarray, answer: np.ndarray, days: np.ndar
 class Read:
     """What a network answers to frames of a set, trial by trial, by what it is told; and the truth of all frames."""
 
-    told: dict[str, list[Estimate]]
+    estimates: dict[str, list[Estimate]]
     margin: Float[np.ndarray, " frames"]
     ratio: Float[np.ndarray, " frames"]
     day: Int[np.ndarray, " frames"]
@@ -192,21 +192,21 @@ class Read:
 
     def answers(self, name: str) -> Float[np.ndarray, " frames"]:
         """Margins where so much is told."""
-        return np.concatenate([one.margin for one in self.told[name]])
+        return np.concatenate([one.margin for one in self.estimates[name]])
 
 
 def read_frames(run: Network, name: str, *, trials: int | None = None) -> Read:
     """Read a few frames of each trial of a set, told more or less of its friction."""
     rng = np.random.default_rng(DRAWS[name])
-    told: dict[str, list[Estimate]] = {}
+    estimates: dict[str, list[Estimate]] = {}
     truth, ratios, days, wet = [], [], [], []
     for plan in plans_of_set(name, trials=trials):
         seen, friction = draw(run, plan, rng=rng), friction_of(plan)
-        untold = run.estimate(seen.inputs)
+        one_frame = run.estimate(seen.inputs)
         slip = draw(run, earlier_grasp(plan, friction, rng=rng), rng=rng, before_slip=BEFORE_SLIP)
         slipped = run.estimate(slip.inputs).ratio
         wrong = friction * rng.uniform(1 - WITHIN, 1 + WITHIN)
-        told.setdefault("one_frame", []).append(untold)
+        estimates.setdefault("one_frame", []).append(one_frame)
         known: dict[str, Friction] = {}
         if slipped is not None:
             known = {
@@ -215,21 +215,21 @@ def read_frames(run: Network, name: str, *, trials: int | None = None) -> Read:
                 "one_slip": learn(slipped),
             }
         for what, one in known.items():
-            told.setdefault(what, []).append(untold.with_friction(one, run.require_ratio()))
+            estimates.setdefault(what, []).append(one_frame.with_friction(one, run.require_ratio()))
         truth.append(seen.margin)
         ratios.append(seen.ratio)
         days.append(np.full(len(seen.margin), plan.day))
         wet.append(np.full(len(seen.margin), plan.condition == "wet"))
     margin, ratio, day, is_wet = map(np.concatenate, (truth, ratios, days, wet))
-    return Read(told=told, margin=margin, ratio=ratio, day=day, wet=is_wet)
+    return Read(estimates=estimates, margin=margin, ratio=ratio, day=day, wet=is_wet)
 
 
 def summarise(read: Read) -> dict[str, Any]:
     """R2 of the margin by what is told, dry and wet, with intervals; what the 90 % intervals hold; what is `known`."""
-    untold = read.told["one_frame"]
-    ratios = [one.ratio for one in untold if one.ratio is not None]
-    is_known = [one.known for one in untold if one.known is not None]
-    found: dict[str, Any] = {"trials": len(untold), "frames": len(read.margin)}
+    one_frame = read.estimates["one_frame"]
+    ratios = [one.ratio for one in one_frame if one.ratio is not None]
+    is_known = [one.known for one in one_frame if one.known is not None]
+    found: dict[str, Any] = {"trials": len(one_frame), "frames": len(read.margin)}
     for condition, rows in (("dry", ~read.wet), ("wet", read.wet)):
         if ratios:
             found[f"ratio_r2_{condition}"] = r2(read.ratio[rows], np.concatenate([one.mean for one in ratios])[rows])
@@ -237,7 +237,7 @@ def summarise(read: Read) -> dict[str, Any]:
             found[f"ratio_in_90_{condition}"] = held(read.ratio, intervals, rows)
         if is_known:
             found[f"known_below_5_{condition}"] = float(np.mean(np.concatenate(is_known)[rows] < 0.05))
-        for name, estimates in read.told.items():
+        for name, estimates in read.estimates.items():
             answer, key = read.answers(name), f"{name}_r2_{condition}"
             found |= r2_over_days(key, read.margin[rows], answer[rows], read.day[rows])
             found[f"{name}_in_90_{condition}"] = held(read.margin, [one.interval(0.9) for one in estimates], rows)
@@ -255,7 +255,7 @@ def lead(
 def leads(read: Read, other: Read) -> dict[str, float]:
     """What one network is ahead of another on the same frames, by what is told to both."""
     found: dict[str, float] = {}
-    for name in read.told.keys() & other.told.keys():
+    for name in read.estimates.keys() & other.estimates.keys():
         for condition, rows in (("dry", ~read.wet), ("wet", read.wet)):
             answers = read.answers(name), other.answers(name)
             found |= lead(f"{name}_lead_{condition}", read.margin, answers, read.day, rows)

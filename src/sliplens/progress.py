@@ -1,4 +1,4 @@
-"""Progress of long work, told to whoever called it.
+"""Progress of long work, reported to the caller.
 
 Whatever takes long takes `on_progress`, called with how many are done and how many there are. Work of several stages
 also names them where the callback can show that (`Stages`), as the command line's can.

@@ -236,7 +236,7 @@ def test_a_second_answer_is_learnt(frames: tuple[FrameSet, FrameSet], ratio_run:
 def test_an_evaluation_tells_what_was_told(frames: tuple[FrameSet, FrameSet], ratio_run: Path, histogram_run: Path):
     trained = load(ratio_run)
     untold, each = evaluate_frames(trained, frames[1]), evaluate_frames(trained, frames[1], friction="each")
-    assert (untold.friction, each.friction) == ("", "that of each trial, told exactly")
+    assert (untold.friction, each.friction) == ("", "that of each trial, given exactly")
     assert untold.ratio_r2.keys() == untold.conditions.keys()
     # one by one, as a slow reader would
     for value in np.unique(frames[1].friction):

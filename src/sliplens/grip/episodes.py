@@ -232,7 +232,7 @@ class Tick:
     reading: FingertipReading
     """Measurement before the step; the controller gets an earlier one."""
     slip: Bool[np.ndarray, " episodes"]
-    """True where the controller is told of a slip."""
+    """True where the controller receives slip events."""
 
 
 class GripLoop:

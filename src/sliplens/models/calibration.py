@@ -46,7 +46,7 @@ class Traction:
 
     calibration: Calibration
     """Of the ratio; its errors are ratios, not margins."""
-    told: Calibration
+    known_friction: Calibration
     """Calibration of the margin under each validation trial's known friction; the temperature is that of the margin."""
     friction: Annotated[tuple[Annotated[float, Meta(gt=0)], ...], Meta(min_length=1)]
     """Evenly spaced quantiles of the coefficient of friction over the training frames, from the least to the largest:

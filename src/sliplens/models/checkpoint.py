@@ -404,7 +404,7 @@ class Estimate:
     def with_friction(self, friction: Friction | Float[np.ndarray, " frames"], traction: Traction) -> "Estimate":
         """Condition the margins on a friction, or that of each frame (`condition_on_friction`), within [0, 1].
 
-        `traction`: that of the network, whose intervals of such margins they get (`Traction.told`).
+        `traction`: that of the network, whose intervals of such margins they get (`Traction.known_friction`).
         """
         assert self.probabilities is not None
         assert self.edges is not None
@@ -427,7 +427,7 @@ class Estimate:
             self,
             margin=margin,
             probabilities=probabilities,
-            calibration=traction.told,
+            calibration=traction.known_friction,
             friction=friction if common else None,
             alone=None,
         )

@@ -133,7 +133,7 @@ def table_accuracy(results: Results) -> CellTable:
                 )
             )
     text = "".join(
-        f" {style.input_name(name)}: the network was told the friction, {evaluation.friction}."
+        f" {style.input_name(name)}: the network was given the friction, {evaluation.friction}."
         for name, evaluation in evaluations.items()
         if evaluation.friction
     )

@@ -197,7 +197,7 @@ def evaluate_frames(
             {"known": estimate.known, "spread": None if sigma is None else -sigma},
         ),
         sequence=sequence,
-        friction="that of each trial, told exactly" if friction == EACH else str(estimate.friction or ""),
+        friction="that of each trial, given exactly" if friction == EACH else str(estimate.friction or ""),
         ratio_r2=ratio_r2,
     )
 

@@ -311,7 +311,7 @@ def calibrate(
         ratio_logits[finite], model.ratio_edges, model.ratio_temperature, validation.traction_ratio[finite]
     )
     quantiles = np.quantile(trained_friction[np.isfinite(trained_friction)], np.linspace(0, 1, 11))
-    traction = Traction(calibration=of_ratio, told=of_ratio, friction=tuple(quantiles.tolist()))
+    traction = Traction(calibration=of_ratio, known_friction=of_ratio, friction=tuple(quantiles.tolist()))
     edges = bin_edges(model)
     estimate = Estimate(
         margin=probabilities[rows] @ model.centres.cpu().double().numpy(),
@@ -324,7 +324,7 @@ def calibrate(
     with_friction = conformal_calibration(
         estimate.margin, estimate.probabilities, edges, labels[finite], temperature=calibration.temperature
     )
-    return calibration, replace(traction, told=with_friction)
+    return calibration, replace(traction, known_friction=with_friction)
 
 
 def fit(

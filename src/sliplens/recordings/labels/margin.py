@@ -66,7 +66,7 @@ def interpolate_forces(
 _CONTACT_SIGMAS, _CONTACT_SHARE = 8.0, 0.05
 LARGEST_SIGMA = 0.2
 """Largest standard uncertainty of a valid margin: beyond, full stick and slip are hardly different."""
-_STUCK_SIGMAS = 2.0  # a margin nearer to 1 than so many standard deviations cannot be told from full stick
+_STUCK_SIGMAS = 2.0  # a margin nearer to 1 than so many standard deviations cannot be distinguished from full stick
 _RATE_STEPS = 3.0  # frames on either side over which the rate of the margin is measured: fewer would show the noise
 _MOST_LOST = 0.5  # share of the samples between touch and slip that may be faulty
 _PLAUSIBLE_FRICTION, _USUAL_FRICTION = (0.05, 4.0), 1.5  # of soft skins on anything; of dry rubber on glass
