@@ -120,7 +120,7 @@ def ratio_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A network of the ChromaTouch that answers with the margin and with F_t / F_n."""
     calibration = Calibration(temperature=1.0, offsets={"0.9": 0.05}, frames=100, mse=0.01)
     friction = tuple(0.15 + 0.105 * part for part in range(11))
-    traction = Traction(calibration=calibration, told=calibration, friction=friction)
+    traction = Traction(calibration=calibration, known_friction=calibration, friction=friction)
     return save_untrained(tmp_path_factory.mktemp("ratio-run"), frame_size=224, traction=traction)
 
 
@@ -128,7 +128,7 @@ def ratio_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def sequence_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A network with two answers and a head for several frames, all of random weights."""
     sure = Calibration(temperature=1.0, offsets={"0.9": 0.02}, frames=100, mse=0.01)
-    traction = Traction(calibration=sure, told=sure, friction=(0.2, 0.7, 1.2))
+    traction = Traction(calibration=sure, known_friction=sure, friction=(0.2, 0.7, 1.2))
     folder = save_untrained(tmp_path_factory.mktemp("sequence") / "run", traction=traction)
     alone = load(folder)
     with torch.random.fork_rng(devices=[]):

@@ -15,7 +15,7 @@ from sliplens.models.onnx import export_onnx
 
 CALIBRATION = Calibration(temperature=1.0, offsets={"0.68": 0.02, "0.9": 0.05}, frames=100, mse=0.01)
 TRACTION = Traction(
-    calibration=CALIBRATION, told=CALIBRATION, friction=tuple(0.15 + 0.105 * part for part in range(11))
+    calibration=CALIBRATION, known_friction=CALIBRATION, friction=tuple(0.15 + 0.105 * part for part in range(11))
 )
 HEADS = ("point", "histogram", "margin-and-ratio")
 

@@ -21,7 +21,7 @@ from sliplens.training.sequence import TrialOutputs
 @pytest.fixture(scope="module")
 def start(tmp_path_factory: pytest.TempPathFactory) -> Path:
     calibration = Calibration(temperature=1.0, offsets={"0.9": 0.05}, frames=100, mse=0.01)
-    traction = Traction(calibration=calibration, told=calibration, friction=(0.2, 0.7, 1.2))
+    traction = Traction(calibration=calibration, known_friction=calibration, friction=(0.2, 0.7, 1.2))
     return save_untrained(tmp_path_factory.mktemp("start") / "run", traction=traction)
 
 
