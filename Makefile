@@ -23,16 +23,16 @@ help: ## list these targets
 
 install: $(INSTALLED) ## set up .venv with the pinned packages and sliplens itself
 
-demo: $(INSTALLED) ## have a first look, in minutes: runs/demo/report.html
+demo: $(INSTALLED) ## write a first result, in minutes: runs/demo/report.html
 	$(BIN)/sliplens demo runs/demo
 
-test: $(INSTALLED) ## run the tests on all cores; the last line says how long they took
+test: $(INSTALLED) ## run the tests on all cores; the last line has their time
 	$(BIN)/pytest --durations 10
 
-fuzz: $(INSTALLED) ## read 10,000 hostile inputs, half an hour or more; given again it goes on
+fuzz: $(INSTALLED) ## open 10,000 hostile inputs, half an hour or more; repeat to continue
 	$(BIN)/python tests/fuzz/run_fuzz.py --inputs 10000 --keep runs/fuzz.jsonl
 
-kills: $(INSTALLED) ## disturb the commands that write 200 times, an hour or less; given again it goes on
+kills: $(INSTALLED) ## interrupt writing commands 200 times, an hour or less; repeat to continue
 	$(BIN)/python tests/fuzz/run_kills.py --faults 200 --keep runs/kills.jsonl
 
 check: $(INSTALLED) ## lint, format, types, floors
@@ -48,23 +48,23 @@ format: $(INSTALLED) ## format the code and sort its imports
 bench: $(INSTALLED) ## run every benchmark
 	@set -e; for script in $(BENCHMARKS); do echo "== $$script"; $(BIN)/python $$script --json; done
 
-docs: $(INSTALLED) ## build the documentation, run its gallery and try every page: docs/_build/index.html
+docs: $(INSTALLED) ## build the documentation, run its gallery and check every page: docs/_build/index.html
 	$(BIN)/python .ci/docs.py
 
 weights: $(INSTALLED) ## train the networks that come with the package: some seven hours on two cores
 	bash .ci/weights.sh
 
-dist: $(INSTALLED) ## build wheel and source archive, and try the wheel on every Python at hand; needs a package index
+dist: $(INSTALLED) ## build wheel and source archive, and test the wheel on every installed Python; needs a package index
 	$(BIN)/python .ci/dist.py
 
 lock: $(UV) ## pin the newest packages that fit, for every supported Python
 	$(UV) pip compile --quiet --upgrade --universal --python-version 3.11 --extra dev --extra docs \
 		--generate-hashes --custom-compile-command "make lock" --output-file .ci/requirements.txt pyproject.toml
 
-audit: $(INSTALLED) ## compare what is installed with .ci/requirements.txt, file by file; asks nobody
+audit: $(INSTALLED) ## compare installed files with .ci/requirements.txt, offline
 	$(BIN)/python .ci/audit.py
 
-clean: ## remove .venv and what the tools cache
+clean: ## remove .venv and the caches of the tools
 	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis .import_linter_cache docs/_build docs/gallery dist
 
 $(UV):

@@ -2,8 +2,8 @@
 Maps of one frame by several methods
 ====================================
 
-Each map answers why the network predicts this margin rather than that of the untouched sensor. Maps are signed and in
-margin units: orange lowers the margin, blue raises it.
+Compute maps of one frame by several methods. Each map explains the difference of the predicted margin from that of the
+untouched sensor. Maps are signed and in margin units: orange lowers the margin, blue raises it.
 """
 
 import matplotlib.pyplot as plt
@@ -43,7 +43,7 @@ for ax, (method, explanation) in zip(axes.flat, maps.items(), strict=True):
 plt.show()
 
 # %%
-# The maps disagree. Each explanation has warnings of its own:
+# The maps disagree. Each explanation has its warnings:
 for method, explanation in maps.items():
     for notes in explanation.methods.values():
         for warning in notes.warnings:

@@ -2,8 +2,8 @@
 Test maps against redrawn scenes
 ================================
 
-In simulation the effect of a marker can be measured without a map: move the marker back to its rest position, draw the
-frame again, and predict. A map is right if it ranks the markers by these effects.
+Measure the effect of each marker without a map, and compare maps with it. In simulation a marker is moved back to its
+rest position, and the frame is drawn and predicted again. A correct map ranks the markers by these effects.
 """
 
 from dataclasses import replace
@@ -75,5 +75,5 @@ axes[1].set_ylabel("Map (thousandths a pixel)")
 plt.show()
 
 # %%
-# One frame shows how the test works and decides nothing. A :doc:`/study` tests many frames, with groups of markers,
-# controls that use nothing of the network, and intervals.
+# One frame only shows how the test works. A :doc:`/study` tests many frames, with groups of markers, controls that use
+# nothing of the network, and intervals.

@@ -2,8 +2,8 @@
 Choose the fill of a removal test
 =================================
 
-A removal test replaces the pixels that a map ranks highest by a fill, and measures the change of the prediction. With a
-fill that no sensor ever shows, the network responds to the fill instead of the removal.
+Compare fills. A removal test replaces the pixels that a map ranks highest by a fill, and measures the change of the
+prediction. If no sensor shows such a fill, the network responds to the fill instead of the removal.
 """
 
 import matplotlib.pyplot as plt

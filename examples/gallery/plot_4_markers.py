@@ -48,4 +48,4 @@ right.invert_yaxis()
 plt.show()
 
 # %%
-# :doc:`/markers` tells how such a field gives the traction of a real dome.
+# :doc:`/markers` computes traction from such a field, also on a real dome.

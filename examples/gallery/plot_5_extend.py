@@ -54,8 +54,8 @@ plt.show()
 # %%
 # A controller
 # ------------
-# One method gives the force for an observation. This one is proportional to the missing margin, and 1 N where no margin
-# is known.
+# One method returns the force for an observation. This force is proportional to the missing margin, and 1 N if the
+# margin is unknown.
 class Proportional:
     """Force in proportion to the missing margin."""
 

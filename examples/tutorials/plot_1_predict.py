@@ -19,8 +19,8 @@ from sliplens.plots.sheets import write_audits
 # %%
 # The recording
 # -------------
-# You need a video of the sensor that begins before the contact. A simulated grip, saved as a lossless video, stands for
-# it here.
+# You need a video of the sensor that begins before the contact. This page uses a simulated grip, saved as a lossless
+# video.
 folder = Path(mkdtemp())
 simulated = sl.simulate(dry_trials=4, wet_trials=1, days=4, frames_per_trial=120)
 trial = simulated.load(simulated.trials[0])
@@ -45,7 +45,7 @@ plt.show()
 
 # %%
 # At 100 % the whole contact sticks; at 0 % the object slips. The 90 % interval is wide because a single frame hardly
-# shows the friction. A coefficient of friction that you know makes it narrow:
+# shows the friction. A known coefficient of friction makes it narrow:
 friction = float(trial.friction_coefficient[0])
 known = sl.predict("chromatouch-pair", folder / "cup.mkv", reference_frame=0, friction=friction)
 for name, result in (("unknown", predictions), (f"{friction:.2f}", known)):
@@ -56,8 +56,8 @@ for name, result in (("unknown", predictions), (f"{friction:.2f}", known)):
 # %%
 # Compare with forces
 # -------------------
-# If a force sensor was read at the same time, its table gives the margin of every frame. This one has a clock and a
-# zero of its own, and its z axis points down; `import_recordings` estimates all three.
+# If forces were recorded at the same time, `import_recordings` computes the margin of every frame. Here the force sensor
+# has another clock and another zero, and its z axis points down; all three are estimated.
 rng = np.random.default_rng(1)
 time_s = np.arange(0, len(trial.frames) / rate, 1 / 500)
 normal, pull = (

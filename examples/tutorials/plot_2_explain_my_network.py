@@ -2,8 +2,8 @@
 Explain and test my own regressor
 =================================
 
-Explain any PyTorch module with one output an image, and test whether its maps can be trusted. Nothing here is about
-touch: the network estimates how far a handwritten digit is turned.
+Explain any PyTorch module with one output an image, and test whether its maps can be trusted. The example is not about
+touch: the network estimates the slant of a handwritten digit.
 """
 
 import matplotlib.pyplot as plt
@@ -85,5 +85,6 @@ plt.show()
 
 # %%
 # How far to trust it: a map is better than another only where the interval of their difference excludes zero, and it
-# must be better than every control. Twelve digits and one network show the steps. Black pixels are paper here, so that
-# black is a baseline that the network knows; for other images choose ``baseline="mean"``, ``"blurred"`` or an image.
+# must be better than every control. Twelve digits and one network only show the steps. Black is the
+# background of the training images, so it is a suitable baseline here; for other images choose ``baseline="mean"``,
+# ``"blurred"`` or an image.

@@ -2,7 +2,7 @@
 Predict live, and control a grip
 ================================
 
-Predict the margin of a running camera, and let a controller set the grip force by it.
+Predict the margin of a running camera, and control a grip force with it.
 """
 
 from pathlib import Path
@@ -16,8 +16,8 @@ import sliplens as sl
 # %%
 # Live
 # ----
-# ``sl.read_live(0, "chromatouch-pair")`` opens the first camera. A stored trial, replayed at its own speed, stands for
-# it here. ``sliplens live 0 --network chromatouch-pair`` opens the same as a page in the browser.
+# ``sl.read_live(0, "chromatouch-pair")`` opens the first camera. This page replays a stored trial at its
+# recorded speed. ``sliplens live 0 --network chromatouch-pair`` opens a page in the browser.
 folder = Path(mkdtemp()) / "replayed"
 sl.simulate(folder, dry_trials=4, wet_trials=1, days=4, frames_per_trial=120)
 readings = list(sl.read_live(folder, "chromatouch-pair", seconds=9.0))
@@ -45,8 +45,8 @@ plt.show()
 # %%
 # Grip
 # ----
-# `run_episodes` simulates a gripper that holds a cup which gets wet. ``fixed`` presses with one force, ``margin``
-# follows the predicted margin, ``oracle`` the true one. The same 200 episodes for each; predictions have the measured
+# `run_episodes` simulates a gripper that holds a cup which gets wet. ``fixed`` uses one force, ``margin`` the predicted
+# margin, ``oracle`` the true one. The same 200 episodes for each; predictions have the measured
 # errors of the network. With a real gripper: ``sliplens hold 0 --network chromatouch-pair --gripper ADDRESS``.
 grips = {
     name: sl.run_episodes("cup", name, condition="patch", episodes=200, seed=5)

@@ -2,8 +2,8 @@ r"""
 Reproduce the thesis
 ====================
 
-Two networks trained as in the thesis, on raw and on difference images; their accuracy on later days; the maps of the
-thesis beside the recommended one; and Table 2. The whole study is one command and takes twenty minutes:
+Repeat the thesis: two networks trained on raw and on difference images, their accuracy on later days, the maps of the
+thesis and the recommended one, and Table 2. The whole study is one command and takes twenty minutes:
 ``sliplens study DATA thesis-difference thesis-raw -o STUDY``. This page uses a few frames.
 """
 
@@ -20,8 +20,8 @@ from sliplens.report.verdict import DELETION
 # %%
 # Data
 # ----
-# The preset ``thesis`` is one simulated sensor. The networks were trained on days 1 to 3 of seed 0; the last two days
-# are new to them.
+# The preset ``thesis`` is one simulated sensor. The networks were trained on days 1 to 3 of seed 0, not on the
+# last two days.
 data = sl.simulate(
     preset="thesis", seed=0, days=12, test_days=2, dry_trials=(2, 1, 1, *[0] * 7, 3, 3), wet_trials=4,
     frames_per_trial=40,
@@ -44,8 +44,8 @@ plt.show()
 # %%
 # Maps (Figs. 9 to 12)
 # --------------------
-# Each map answers why the network predicts this margin rather than that of the last frame before the pull. Orange
-# lowers the margin, blue raises it.
+# Each map explains the difference of the predicted margin from that of the last frame before the pull. Orange lowers
+# the margin, blue raises it.
 trial = data.load(data.select(split="test", condition="dry")[0])
 number = int(np.nanargmin(np.abs(trial.safety_margin - 0.3)))
 stick = int(np.flatnonzero(trial.safety_margin > 0.85)[-1])
@@ -89,5 +89,5 @@ axes[0].set_ylabel("Deletion score D (1)")
 plt.show()
 
 # %%
-# A low score is no proof: a random order of pixels scores as well as some of these methods (:doc:`/deletion`).
+# A low score does not prove a map: a random order of pixels scores as well as some of these methods (:doc:`/deletion`).
 # :doc:`/study` tests the maps against redrawn scenes instead.
