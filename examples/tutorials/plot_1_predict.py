@@ -56,8 +56,8 @@ for name, result in (("unknown", predictions), (f"{friction:.2f}", known)):
 # %%
 # Compare with forces
 # -------------------
-# If forces were recorded at the same time, `import_recordings` computes the margin of every frame. Here the force sensor
-# has another clock and another zero, and its z axis points down; all three are estimated.
+# If forces were recorded at the same time, `import_recordings` computes the margin of every frame. Here the force
+# sensor has another clock and another zero, and its z axis points down; all three are estimated.
 rng = np.random.default_rng(1)
 time_s = np.arange(0, len(trial.frames) / rate, 1 / 500)
 normal, pull = (
