@@ -1,20 +1,18 @@
 """A first look: a simulated grip, predicted, explained and proved, on one page that grows while the rest is made."""
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from sliplens.errors import InputError
 from sliplens.explainers.table import RECOMMENDED_METHOD
-from sliplens.files import DIFFERENCE_NETWORK, require_folder
 from sliplens.models.checkpoint import load
 from sliplens.progress import OnProgress, open_stage, reporting
 from sliplens.recordings import Dataset
 from sliplens.report import write_report
 from sliplens.results.explanation import Strip
 from sliplens.simulation.trials import simulate
-from sliplens.study.explaining import explain, make_strip
+from sliplens.study.explaining import make_strip
 from sliplens.study.stages import keep_record
 from sliplens.training import evaluate
 
@@ -37,7 +35,6 @@ SHOWN_DATA: dict[str, Any] = {
 def run_demo(
     out: Path | str,
     *,
-    real_frames: Path | str | None = None,
     on_page: Callable[[Path], None] | None = None,
     on_progress: OnProgress | None = None,
 ) -> Path:
@@ -51,16 +48,13 @@ def run_demo(
     ----------
     out
         Folder of the demo, a subfolder a stage; the page is `report.html` in it.
-    real_frames
-        Folder of real difference images named ..._GG.png with the safety margin in percent. The public ChromaTouch
-        images where `SLIPLENS_REFERENCE` (or ../shared/reference) holds them, if None.
     on_page
         Called with the page each time it was written.
 
     Raises
     ------
     InputError
-        If the folder holds something else, or there are no real frames where they are named.
+        If the folder holds something else.
 
     See Also
     --------
@@ -73,7 +67,6 @@ def run_demo(
     PosixPath('runs/demo/report.html')
     """
     folder = Path(out)
-    real = find_real_frames(real_frames)
     names = [path.name for path in folder.iterdir() if path.name[0] != "."] if folder.is_dir() else []
     if (folder.exists() and not folder.is_dir()) or (names and "data" not in names):
         raise InputError(f"{folder} exists and is no demo; choose another folder")
@@ -85,33 +78,13 @@ def run_demo(
             on_page(page)
         return page
 
-    real_title = "what a network predicts from real frames"
     data = simulate(folder / "data", on_progress=on_progress, **SHOWN_DATA)
     with reporting(on_progress):
         _make_strip(folder / "strip", data, NETWORKS["difference"])
-    show("how well both networks predict", *([real_title] if real is not None else []))
+    show("how well both networks predict")
     for name, network in NETWORKS.items():
         evaluate(network, data, folder / f"evaluate-{name}", on_progress=on_progress)
-    if real is not None:
-        show(real_title)
-        explain(
-            DIFFERENCE_NETWORK,  # those of the thesis are for one simulated sensor
-            real,
-            method="occlusion",
-            labels_in_names=True,
-            out=folder / "explain-real",
-            on_progress=on_progress,
-        )
     return show()
-
-
-def find_real_frames(folder: Path | str | None = None) -> Path | None:
-    """Folder of real difference images: the one that is named, else the public ChromaTouch images where they are."""
-    if folder is not None:
-        return require_folder(Path(folder), what="the folder of real frames")
-    reference = Path(os.environ.get("SLIPLENS_REFERENCE", "../shared/reference"))
-    images = reference / "chromatouch" / "difference"
-    return images if images.is_dir() else None
 
 
 def _make_strip(folder: Path, data: Dataset, network: str) -> None:
@@ -127,4 +100,4 @@ def _make_strip(folder: Path, data: Dataset, network: str) -> None:
     keep_record(folder, make, stage="strip", config=config, what="a grip from stick to slip")
 
 
-__all__ = ["find_real_frames", "run_demo"]
+__all__ = ["run_demo"]

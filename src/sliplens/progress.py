@@ -5,7 +5,6 @@ also names them where the callback can show that (`Stages`), as the command line
 """
 
 import re
-from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
@@ -65,36 +64,23 @@ class Stages(Protocol):
 
 
 def fold_equal(messages: Iterable[str]) -> list[str]:
-    """Tell once what is said again and again, in the order of the first: names and numbers of the others are folded.
+    """Fold messages that differ in their numbers and in the name they begin with into the first of them.
 
     Examples
     --------
     >>> from sliplens.progress import fold_equal
     >>> fold_equal(["cup-1: 3 s are missing", "dark", "cup-2: 4 s are missing", "dark"])
-    ['cup-1: 3 s are missing (with other numbers also cup-2)', 'dark (2 times)']
+    ['cup-1: 3 s are missing (and 1 more with other names or numbers)', 'dark (2 times)']
     """
-    alike: dict[str, Counter[str]] = {}
+    alike: dict[str, list[str]] = {}
     for message in messages:
-        words = message.removeprefix(_named(message))
-        alike.setdefault(re.sub(r"[-\u2212]?\d+(?:[.,]\d+)?", "#", words), Counter())[message] += 1
+        alike.setdefault(re.sub(r"^\S+: |[-\u2212]?\d+(?:[.,]\d+)?", "#", message), []).append(message)
     folded = []
-    for counts in alike.values():
-        first, times = next(iter(counts.items()))
-        others = [name[:-2] for name in dict.fromkeys(map(_named, counts)) if name != _named(first)]
-        same = len({message.removeprefix(_named(message)) for message in counts}) == 1
-        more = f" and {len(others) - 2} more" if len(others) > 3 else ""
-        if others:
-            names = ", ".join(others[:2] if more else others)
-            repeats = f"{'' if same else 'with other numbers '}also {names}{more}"
-        else:
-            repeats = f"{times} times" if same else f"and {len(counts) - 1} more with other numbers"
-        folded.append(first if counts.total() == 1 else f"{first} ({repeats})")
+    for first, *others in alike.values():
+        different = {*others} - {first}
+        count = f"and {len(different)} more with other names or numbers" if different else f"{len(others) + 1} times"
+        folded.append(f"{first} ({count})" if others else first)
     return folded
-
-
-def _named(message: str) -> str:
-    """Name that a message begins with, and the colon after it; empty where it begins with none."""
-    return match[0] if (match := re.match(r"\S+: ", message)) else ""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -24,7 +24,7 @@ def screen(monkeypatch: pytest.MonkeyPatch) -> Console:
 def test_wide_table_fits_80_columns_with_every_word_whole(screen: Console) -> None:
     numbers = [[name, *(f"0.123 (0.045 to 0.{index}78)" for index in range(5))] for name in METHODS]
 
-    print_table("Scores of explanations", HEAD, numbers)
+    print_table("Scores of explanations", [dict(zip(HEAD, row, strict=True)) for row in numbers])
 
     text = screen.export_text()
     assert max(map(len, text.splitlines())) <= 80
@@ -36,15 +36,19 @@ def test_wide_table_fits_80_columns_with_every_word_whole(screen: Console) -> No
 
 
 def test_numbers_stand_to_the_right_and_words_to_the_left(screen: Console) -> None:
-    print_table("Scores", ["Method", "D", "meaning"], [["a", "0.5", "as it fell"], ["b", "none", "lower"]])
+    rows = [
+        {"Method": "a", "D": "0.5", "meaning": "as it fell", "x": None},
+        {"Method": "b", "D": None, "meaning": "", "x": None},
+    ]
+    print_table("Scores", rows)
 
     text = screen.export_text()
-    assert "│  0.5 │ as it fell │" in text
-    assert "│ none │ lower      │" in text
+    assert "│ 0.5 │ as it fell │\n" in text
+    assert "│   - │            │\n" in text
 
 
 def test_brackets_in_a_table_are_text(screen: Console) -> None:
-    print_table("Scores", ["Method", "D"], [["[red]", "1"]])
+    print_table("Scores", [{"Method": "[red]", "D": 1}])
 
     assert "[red]" in screen.export_text()
 
@@ -60,7 +64,7 @@ def test_names_of_files_move_no_cursor_and_paint_nothing(screen: Console) -> Non
     console.say(HOSTILE, aside=True)
     console.fail(HOSTILE)
     console.print_file(Path(HOSTILE), HOSTILE)
-    print_table(HOSTILE, [HOSTILE, "D"], [[HOSTILE, "1"]])
+    print_table(HOSTILE, [{HOSTILE: HOSTILE, "D": 1}])
 
     text = screen.export_text(styles=False)
     told = r"cup[/][red]\x1b[2J\x1b]0;owned\x07\r\n\u202egnp.tac\udc80"
@@ -119,6 +123,6 @@ def test_messages_that_differ_in_numbers_alone_are_one_line() -> None:
     messages = ["grad-cam loses by 0.10", "poly-cam loses by 0.10", "grad-cam loses by -0.25", "grad-cam loses by 0.3"]
 
     assert fold_equal(messages) == [
-        "grad-cam loses by 0.10 (and 2 more with other numbers)",
+        "grad-cam loses by 0.10 (and 2 more with other names or numbers)",
         "poly-cam loses by 0.10",
     ]

@@ -116,10 +116,6 @@ def test_changed_force_samples_are_found(tmp_path: Path, trial: Recording, relab
     assert run("check", tmp_path / "data") == 2
 
 
-def margins(folder: Path, trial: Recording) -> np.ndarray:
-    return load_recording(trial_path(folder, trial.trial), pixels=False).safety_margin
-
-
 def test_corrections_give_the_labels_of_their_settings_and_removed_those_of_before(
     tmp_path: Path, trial: Recording, relabelled: Path, capsys: pytest.CaptureFixture[str]
 ):

@@ -37,7 +37,6 @@ MISTAKES = {
     "study DATA -o OUT --on cloud": "no executor named 'cloud'",
     "report EMPTY": "EMPTY",
     "demo EMPTY/..": "is no demo; choose another folder",
-    "demo OUT --real-frames NOTHING": "folder of real frames",
     f"simulate {SMALL}": "name the folder of the data set with -o FOLDER",
     "simulate OUT --days 1": "days is 1, but at least 2 are needed",
     f"simulate OUT --seed -1 {SMALL}": "seed is -1",

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
-from command_line import typed
+from command_line import table_cells, typed
 from own_recording import write_video
 from pyarrow.csv import read_csv
 
@@ -81,13 +81,13 @@ def test_few_frames_are_told_one_by_one(difference_run: Path, difference_folder:
 def test_many_frames_are_told_by_their_lowest(difference_run: Path, small_dataset: Dataset, tmp_path: Path, capsys):
     run(difference_run, small_dataset.folder, "-o", tmp_path / "a.csv", "--plot", tmp_path / "a.png")
     rows = read_csv(tmp_path / "a.csv").to_pylist()
-    lines = capsys.readouterr().out.splitlines()
+    cells = table_cells(capsys.readouterr().out)
     for trial in {row["trial"] for row in rows}:
         margins = [row["prediction"] for row in rows if row["trial"] == trial]
         touching = [row["prediction"] for row in rows if row["trial"] == trial and row["touches"]]
-        (line,) = (line for line in lines if line.startswith(f"{trial}: "))
-        assert f"lowest {100 * min(touching):.0f} %" in line
-        assert f"{len(margins)} frames, {len(touching)} touch" in line
+        (row,) = (row for row in cells if row[0] == trial)
+        assert row[1] == f"{100 * min(touching):.0f} %"
+        assert row[3:] == [str(len(margins)), str(len(touching))]
     assert {"normal_force_n", "tangential_force_n", "safety_margin"} <= rows[0].keys()
     assert (tmp_path / "a.png").stat().st_size > 10_000
 
@@ -109,9 +109,8 @@ def test_what_is_withheld_has_no_margin_on_the_terminal(
     counts = [int(line.split()[2]) for line in lines if line.startswith("withheld in ")]
     assert sum(counts) == len(withheld) > 0
     if shown == slice(None):
-        [line] = (line for line in lines if line.startswith("frames: "))
-        assert "lowest none" in line
-        assert f"{len(withheld)} withheld" in line
+        [row] = (row for row in table_cells("\n".join(lines)) if row[0] == "frames")
+        assert (row[1], row[-1]) == ("none", str(len(withheld)))
     else:
         told = {line.split()[1]: line for line in lines if ".png" in line}
         assert all("withheld" in told[name] for name in withheld)

@@ -5,15 +5,10 @@ import shutil
 from pathlib import Path
 
 import pytest
-from command_line import run
+from command_line import run, table_cells
 from data_sets import contents
 
 from sliplens.recordings import Dataset, load_dataset
-
-
-def cells(out: str) -> list[list[str]]:
-    """Rows of the tables that were shown."""
-    return [[cell.strip() for cell in line.strip("│").split("│")] for line in out.splitlines() if "│" in line]
 
 
 @pytest.fixture
@@ -38,10 +33,10 @@ def test_the_trials_go_where_the_table_says(folder: Path, table: Path, capsys: p
     splits = {info.trial[-1]: info.split for info in load_dataset(folder).trials}
     assert splits == {**dict.fromkeys("01246", "train"), "5": "validation", **dict.fromkeys("37", "test")}
     out = capsys.readouterr().out
-    assert ["train", "5", "60", "1, 2, 3", "-", "dry"] in cells(out)
-    assert ["test", "2", "24", "4", "-", "dry, wet"] in cells(out)
-    assert ["test", "train", "1", "test-dry-6"] in cells(out)
-    assert ["train", "test", "1", "train-dry-3"] in cells(out)
+    assert ["train", "5", "60", "1, 2, 3", "-", "dry"] in table_cells(out)
+    assert ["test", "2", "24", "4", "-", "dry, wet"] in table_cells(out)
+    assert ["test", "train", "1", "test-dry-6"] in table_cells(out)
+    assert ["train", "test", "1", "train-dry-3"] in table_cells(out)
     assert "3 of 8 trials moved" in out
     assert "train again" in out
     assert run("check", folder) == 0
@@ -61,7 +56,7 @@ def test_names_with_brackets_are_shown_as_they_are(folder: Path, table: Path, ca
         trial["object"] = "mug [blue]"
     (folder / "dataset.json").write_text(json.dumps(rows))
     assert run("split", folder, "--splits", table, "--dry-run") == 0
-    assert {row[4] for row in cells(capsys.readouterr().out) if len(row) == 6} == {"mug [blue]"}
+    assert {row[4] for row in table_cells(capsys.readouterr().out) if len(row) == 6} == {"mug [blue]"}
 
 
 def test_trials_are_dealt_by_a_fact_and_leaks_are_noted(folder: Path, capsys: pytest.CaptureFixture[str]):

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from quick import DEFAULTS, QUICK
+from quick import QUICK
 from torch import Tensor, nn
 
 from sliplens.explainers.gradients import ExpectedGradients
@@ -13,8 +13,7 @@ from sliplens.explainers.poly_cam import PolyCam
 from sliplens.faithfulness.controls import control_maps
 
 pytestmark = pytest.mark.usefixtures("short_guess")
-CHEAP = DEFAULTS | {
-    **QUICK,
+CHEAP = QUICK | {
     "poly-cam": PolyCam(budget=0.1, likeness=None),
     "poly-cam-thesis": PolyCam(published=True, level=5, budget=0.1, likeness=None),
 }

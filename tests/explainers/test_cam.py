@@ -1,7 +1,7 @@
 import pytest
 import torch
 from captum import attr
-from quick import saliency
+from quick import Count, saliency
 from torch import nn
 from torchcam.methods import GradCAM
 
@@ -57,15 +57,6 @@ def test_equals_captum_with_its_sign(name, layer, network, images):
 
 
 def test_images_and_references_share_a_pass(network, images):
-    class Count(nn.Module):
-        def __init__(self, inner: nn.Module) -> None:
-            super().__init__()
-            self.inner, self.batches = inner, []
-
-        def forward(self, images):
-            self.batches.append(len(images))
-            return self.inner(images)
-
     counted = Count(network("small shufflenet"))
     GradCam()(counted, images)
     assert counted.batches == [1, 3 + 1]  # the search for layers; the images and the reference that all share

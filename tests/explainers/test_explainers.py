@@ -4,12 +4,12 @@ import copy
 
 import pytest
 import torch
-from quick import DEFAULTS, saliency
+from quick import QUICK, saliency
 from torch import nn
 
 from sliplens.errors import ImageError, InputError, ModelError
 from sliplens.explainers.attribution import Attribution
-from sliplens.explainers.gradients import ExpectedGradients, IntegratedGradients, SmoothGrad
+from sliplens.explainers.gradients import SmoothGrad
 from sliplens.explainers.occlusion import Occlusion
 from sliplens.explainers.poly_cam import PolyCam
 from sliplens.explainers.shapley import Shapley
@@ -20,29 +20,7 @@ from sliplens.progress import reporting
 NAMES = [name for name in EXPLAINERS if not name.endswith("-thesis")]
 pytestmark = pytest.mark.usefixtures("short_guess")
 every_explainer = pytest.mark.parametrize("name", NAMES)
-# an untrained network is so rough that integrated gradients would go to their most steps in every test
-SHORT = IntegratedGradients(steps=4, max_steps=8)
-MARKERS = torch.tensor([[3.0, 3.0], [5.0, 60.0], [30.0, 31.0], [47.0, 12.0]])
-QUICK = DEFAULTS | {
-    "integrated-gradients": SHORT,
-    "expected-gradients": ExpectedGradients(steps=4, max_steps=8),
-    "smooth-grad": SmoothGrad(samples=3),
-    # the images here show none
-    "occlusion-marker": Occlusion(markers_px=MARKERS),
-    "shapley": Shapley(tile_px=32),
-    "shapley-marker": Shapley(markers_px=MARKERS),
-}
 CAMS = ["grad-cam", "poly-cam"]
-# what adds up to f(x) - f(reference), for some networks at least
-COMPLETE = [
-    "grad-cam",
-    "poly-cam",
-    "integrated-gradients",
-    "expected-gradients",
-    "shapley",
-    "shapley-marker",
-]
-
 HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
 
 

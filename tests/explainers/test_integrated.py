@@ -1,29 +1,8 @@
 import torch
+from quick import Count, Linear
 from torch import nn
 
 from sliplens.explainers.gradients import IntegratedGradients
-
-
-class Linear(nn.Module):
-    def __init__(self, weights) -> None:
-        super().__init__()
-        self.weights = nn.Parameter(weights)
-
-    def forward(self, images):
-        return (images * self.weights).sum(dim=(1, 2, 3))
-
-
-class Count(nn.Module):
-    """Counts the images that go through a network."""
-
-    def __init__(self, network: nn.Module) -> None:
-        super().__init__()
-        self.network = network
-        self.batches: list[int] = []
-
-    def forward(self, images):
-        self.batches.append(len(images))
-        return self.network(images)
 
 
 def test_is_exact_on_a_linear_model(images, reference):

@@ -4,7 +4,7 @@ import copy
 
 import pytest
 import torch
-from quick import DEFAULTS, QUICK, SHORT
+from quick import QUICK, SHORT
 
 from sliplens.explainers.cam import find_layers
 from sliplens.explainers.poly_cam import PolyCam
@@ -12,7 +12,7 @@ from sliplens.explainers.poly_cam import PolyCam
 pytestmark = pytest.mark.usefixtures("short_guess")
 every_network = pytest.mark.parametrize("name", ["shufflenet", "resnet", "mobilenet", "vgg"])
 # the thesis's level is one of ShuffleNetV2's layers
-CHEAP = {name: explain for name, explain in (DEFAULTS | QUICK).items() if name != "poly-cam-thesis"}
+CHEAP = {name: explain for name, explain in QUICK.items() if name != "poly-cam-thesis"}
 
 
 @every_network

@@ -1,18 +1,9 @@
 import pytest
 import torch
-from torch import nn
+from quick import Linear
 
 from sliplens.explainers.gradients import IntegratedGradients
 from sliplens.explainers.occlusion import Occlusion, marker_regions
-
-
-class Linear(nn.Module):
-    def __init__(self, weights) -> None:
-        super().__init__()
-        self.weights = nn.Parameter(weights)
-
-    def forward(self, images):
-        return (images * self.weights).sum(dim=(1, 2, 3))
 
 
 @pytest.fixture

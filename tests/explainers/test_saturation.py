@@ -2,13 +2,13 @@
 
 import pytest
 import torch
-from quick import DEFAULTS
+from quick import QUICK
 from torch import nn
 
 from sliplens.explainers.gradients import IntegratedGradients, SmoothGrad
 
 # noise as small as a flat network is flat for
-METHODS = DEFAULTS | {"smooth-grad": SmoothGrad(samples=4, noise=0.01)}
+METHODS = QUICK | {"integrated-gradients": IntegratedGradients(), "smooth-grad": SmoothGrad(samples=4, noise=0.01)}
 BY_GRADIENT = ("grad-cam", "smooth-grad", "integrated-gradients")
 
 

@@ -30,3 +30,8 @@ def typed(*words: object) -> None:
 def command(name: str, **options: object) -> None:
     """Call a command with parsed options; errors are raised instead of printed."""
     adapt(COMMANDS[name])[0](**options)
+
+
+def table_cells(out: str) -> list[list[str]]:
+    """Rows of the tables that were printed."""
+    return [[cell.strip() for cell in line.strip("│").split("│")] for line in out.splitlines() if "│" in line]

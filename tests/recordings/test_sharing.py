@@ -55,8 +55,3 @@ def test_recorded_data_are_told_by_files_and_names(recording: Recording, tmp_pat
         told = "".join(capsys.readouterr().err.split())
         assert ("has,too:" in told) == bool(note)
         assert note.replace(" ", "") in told
-
-
-def test_the_command_counts_the_trials_that_trained_a_network(data: Dataset, difference_run: Path, capsys):
-    assert run("check", data.folder, "--against", difference_run) == 0
-    assert "was trained on 0 of the" in " ".join(capsys.readouterr().out.split())

@@ -8,17 +8,17 @@ from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from functools import cached_property, partial
 from importlib import import_module
 from inspect import Parameter, Signature, signature
-from itertools import pairwise, takewhile
+from itertools import pairwise
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, Union, Unpack, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, Unpack, get_args, get_origin, get_type_hints, is_typeddict
 
 import cyclopts
 import docstring_parser
 
 from sliplens.cli.console import Terminal
 from sliplens.errors import InputError
-from sliplens.files import find_run, partial_folder, require_folder, require_new_file
+from sliplens.files import partial_folder, require_new_file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,30 +54,11 @@ class Command:
         return ["-o", "--output"] if parameter == "out" else aliases
 
     def refuse_early(self, words: Sequence[str]) -> None:
-        """Refuse networks, data and files that are not there before the function is imported."""
-        places = [argument.arg for argument in self.definition.args.args]
-        first = list(takewhile(lambda word: not word.startswith("-"), words))
-        texts = {name: [text] for name, text in zip(places, first, strict=False)}
-        if places[:1] == ["sources"]:
-            texts["sources"] = first
-        for name in ("network", "networks", "start_from", "data", "source", "out", "overwrite"):
-            for option in (f"--{name.replace('_', '-')}", *self.names_of(name)):
-                if option in words:
-                    values = list(takewhile(lambda word: not word.startswith("-"), words[words.index(option) + 1 :]))
-                    texts[name] = values if name == "networks" else values[:1]
-        # `predict FILE` names no network
-        runs, source = ("run", "source") if "source" in texts or places[1:2] != ["source"] else ("", "run")
-        for network in (each for name in ("network", "networks", "start_from", runs) for each in texts.get(name, ())):
-            find_run(Path(network))
-        for data in texts.get("data", ()):
-            require_folder(Path(data), what="the data set")
-        for path in (*texts.get("sources", ()), *(texts.get(source, ()) if "run" in texts else ())):
-            if not Path(path).exists():
-                raise InputError(f"{path} does not exist; check the path")
-        for out in map(Path, texts.get("out", ())):
-            if self.suffixes and out.suffix:
-                overwrite = "overwrite" in texts or partial_folder(out).exists()
-                require_new_file(out, suffix=self.suffixes, overwrite=overwrite)
+        """Refuse a file that cannot be written before the function is imported, which may take seconds."""
+        for option, out in pairwise(words):
+            if option in {"--out", *self.names_of("out")} and self.suffixes and Path(out).suffix:
+                overwrite = "--overwrite" in words or partial_folder(Path(out)).exists()
+                require_new_file(Path(out), suffix=self.suffixes, overwrite=overwrite)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,42 +124,36 @@ def adapt(command: Command) -> tuple[Callable[..., object], list[str]]:
     return call, list(by_name)
 
 
-def _options(function: Callable[..., object], *, further: bool = False) -> list[_Option]:
-    """Return the parameters of a function that can be typed, if `further` those of `Command.run` besides the call.
+def _options(kind: Any, *, further: bool = False, group: str = "") -> list[_Option]:
+    """Return the parameters of a function, or the fields of a dataclass or TypedDict, that can be typed.
 
-    Fields of dataclasses are options of their own.
+    If `further`, those of `Command.run` besides the call. Fields of dataclasses are options of their own.
     """
-    helps, hints, options = _parameter_help(function), get_type_hints(function), dict[str, _Option]()
-    for name, parameter in list(signature(function).parameters.items())[further:]:
-        hint, default = hints.get(name, Any), parameter.default
-        kind, group = typed_kind(hint), _options_type(hint)
-        if parameter.kind is Parameter.VAR_KEYWORD or group is not None:
-            for option in _fields_of(*get_args(hint)) if group is None else _fields_of(group, group=name):
-                options.setdefault(option.name, replace(option, further=further))
-        elif kind is not None:
+    helps, hints, options = _parameter_help(kind), get_type_hints(kind), dict[str, _Option]()
+    if is_typeddict(kind):
+        parameters = {name: Parameter(name, Parameter.KEYWORD_ONLY, default=None) for name in hints}
+    else:
+        parameters = signature(kind).parameters
+    for name, parameter in list(parameters.items())[further:]:
+        hint, default, nested = hints.get(name, Any), parameter.default, []
+        typed, record = typed_kind(hint), _options_type(hint)
+        if typed is not None:
             options[name] = _Option(
                 name=name,
-                kind=kind,
-                default=(default,) if isinstance(default, str) and get_origin(kind) is tuple else default,
+                kind=typed,
+                default=(default,) if isinstance(default, str) and get_origin(typed) is tuple else default,
                 help=helps.get(name, ""),
                 positional=parameter.kind is Parameter.POSITIONAL_OR_KEYWORD,
+                group=group,
                 further=further,
             )
+        elif parameter.kind is Parameter.VAR_KEYWORD:
+            nested = _options(*get_args(hint))
+        elif record is not None and (not inspect.isclass(kind) or record.__name__.endswith("Options")):
+            nested = _options(record, group=name)
+        for option in nested:
+            options.setdefault(option.name, replace(option, further=further))
     return list(options.values())
-
-
-def _fields_of(kind: Any, *, group: str = "") -> list[_Option]:
-    """Return the fields of a dataclass or TypedDict as options."""
-    helps, options = _parameter_help(kind), []
-    defaults = {field.name: field.default for field in fields(kind)} if is_dataclass(kind) else {}
-    for name, hint in get_type_hints(kind).items():
-        typed, inner = typed_kind(hint), _options_type(hint)
-        if typed is not None:
-            about = {"default": defaults.get(name), "help": helps.get(name, "")}
-            options.append(_Option(name=name, kind=typed, group=group, **about))
-        elif inner is not None and inner.__name__.endswith("Options") and not group:
-            options += _fields_of(inner, group=name)
-    return options
 
 
 def _parameter_help(kind: Any) -> dict[str, str]:

@@ -75,22 +75,15 @@ def _say_friction(name: str, reader: "LiveReader") -> None:
 @command("demo", "demo:run_demo", "sliplens demo runs/demo")
 def call_demo(call: Any) -> None:
     """Print where the page is as soon as it exists; its notes are on the page."""
-    started = time.perf_counter()
-    pages: list[Path] = []
-    notes: list[str] = []
+    pages, terminal = list[Path](), Terminal()
 
     def on_page(page: Path) -> None:
         if not pages:
             say(f"open {page.resolve()} now: it grows while the rest is made")
         pages.append(page)
 
-    terminal = Terminal()
-    terminal.note = notes.append
-    page = call(on_page=on_page, on_progress=terminal)
-    if notes:
-        say(f"{number_of(len(notes), 'note')} on limitations: see the page")
-    say(f"the demo took {(time.perf_counter() - started) / 60:.1f} minutes")
-    say(f"open {page.resolve()}")
+    terminal.note = lambda _: None
+    say(f"open {call(on_page=on_page, on_progress=terminal).resolve()}")
 
 
 @command(
@@ -200,8 +193,8 @@ def call_simulate(call: Any) -> None:
     frames: dict[str, list[int]] = {}
     for trial in call().trials:
         frames.setdefault(trial.split, []).append(trial.frames)
-    rows = [(split, str(len(counts)), f"{sum(counts):,}") for split, counts in frames.items()]
-    print_table("Simulated", ("split", "trials", "frames"), rows)
+    rows = [{"split": split, "trials": len(counts), "frames": sum(counts)} for split, counts in frames.items()]
+    print_table("Simulated", rows)
 
 
 @command(
@@ -220,7 +213,7 @@ def call_import(call: Any, *, audit: bool = True) -> None:
     data = call()
     output.show_labelled("Imported", data, audit=audit)
     if data.left_out:
-        print_table("Left out", ("trial", "why"), [(trial.trial, trial.why) for trial in data.left_out])
+        print_table("Left out", [{"trial": trial.trial, "why": trial.why} for trial in data.left_out])
         raise SystemExit(1)
 
 
@@ -264,15 +257,14 @@ def call_split(call: Any) -> None:
 
     data = load_dataset(call.keywords["data"])
     result = call(data=data)
-    moves = [(info, split) for info, split in zip(data.trials, result.splits, strict=True) if info.split != split]
+    moves = sum(info.split != split for info, split in zip(data.trials, result.splits, strict=True))
     output.show_splits(data.trials, result.splits)
-    output.show_moves(moves)
     for note in result.notes:
         say(f"note: {note}")
     if call.keywords.get("dry_run"):
         say("nothing is written (--dry-run)")
         return
-    print_file(data.folder, f"{len(moves)} of {len(data.trials)} trials moved")
+    print_file(data.folder, f"{moves} of {len(data.trials)} trials moved")
     if moves:
         say("networks trained before had other splits: a trial of the test may have trained them; train again")
 
@@ -280,16 +272,13 @@ def call_split(call: Any) -> None:
 @command("check", "recordings.check:check_dataset", "sliplens check runs/mine/data")
 def call_check(call: Any) -> None:
     """Print the findings; exit code 2 if there are any."""
-    from sliplens.recordings.dataset import DATASET_FILE, load_dataset, trial_path
+    from sliplens.recordings.dataset import load_dataset, trial_path
     from sliplens.recordings.store import read_header
 
-    data, other = load_dataset(call.keywords["data"]), call.keywords.get("against")
-    if other is not None and not (Path(other) / DATASET_FILE).is_file():
-        output.print_known_trials(data, Path(other))
-        other = None
-    findings = call(data=data, against=other)
+    data = load_dataset(call.keywords["data"])
+    findings = call(data=data)
     if findings:
-        print_table("Findings", ("where", "what"), [(finding.where, finding.what) for finding in findings])
+        print_table("Findings", [{"where": finding.where, "what": finding.what} for finding in findings])
         count = number_of(len(findings), "error")
         raise RecordingError(f"{data.folder} has {count}, listed above; correct or make these trials again")
     size = f"{number_of(len(data.trials), 'trial')}, {number_of(data.frames, 'frame')}"
@@ -309,10 +298,11 @@ def call_slip(call: Any) -> None:
     """Print the balanced accuracy of the slip detector and of trivial baselines."""
     with reporting(Terminal()), open_stage("Reading clips"):
         result = call()
-    names = ("method", "balanced_accuracy", "low", "high")
-    method, *values = (getattr(result.scores, name) for name in names)
-    rows = [(name, *(f"{value:.2f}" for value in row)) for name, *row in zip(method, *values, strict=True)]
-    print_table(f"Slip of {number_of(len(result.fall), 'clip')}", [name.replace("_", " ") for name in names], rows)
+    rows = [
+        {name.replace("_", " "): value if isinstance(value, str) else f"{value:.2f}" for name, value in row.items()}
+        for row in result.scores.to_arrow().select(["method", "balanced_accuracy", "low", "high"]).to_pylist()
+    ]
+    print_table(f"Slip of {number_of(len(result.fall), 'clip')}", rows)
 
 
 @command(

@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from threading import RLock
@@ -97,22 +97,26 @@ class Terminal:
         self._notes.clear()
 
 
-def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table, numbers to the right; a terminal too narrow for it shows a line for each cell."""
+def print_table(title: str, rows: Sequence[Mapping[str, str | int | None]]) -> None:
+    """Print a table, numbers to the right, without columns of None; a narrow terminal shows a line for each cell."""
     table = Table(title=_shown(title), title_justify="left")
+    columns = {}
+    for name in rows[0]:
+        cells = [row[name] for row in rows]
+        words = ("-" if cell is None else f"{cell:,}" if isinstance(cell, int) else visible(cell) for cell in cells)
+        columns |= {visible(name): list(words)} if any(cell is not None for cell in cells) else {}
     widest = 1
-    for place, (name, *cells) in enumerate(zip(header, *rows, strict=True)):
+    for place, (name, cells) in enumerate(columns.items()):
         words = name.split() if place else " ".join([name, *cells]).split()  # only the names of rows may be broken
         widest += 3 + max(map(len, [*words, *(cells if place else [])]))
         numbers = place and any(re.match(r"[-+]?\d", cell) for cell in cells)
-        table.add_column(_shown(name), justify="right" if numbers else "left", no_wrap=place > 0 and " " not in name)
-    for row in rows:
-        table.add_row(_shown(row[0]), *(Text(visible(cell), no_wrap=True) for cell in row[1:]))
+        table.add_column(escape(name), justify="right" if numbers else "left", no_wrap=place > 0 and " " not in name)
+    for first, *cells in zip(*columns.values(), strict=True):
+        table.add_row(escape(first), *(Text(cell, no_wrap=True) for cell in cells))
     if widest <= OUT.width:
         OUT.print(table)
         return
     say(title)
-    for row in rows:
-        say(f"{header[0]}: {row[0]}")
-        for name, cell in zip(header[1:], row[1:], strict=True):
-            say(f"  {' '.join(name.split())}: {cell}")
+    for cells in zip(*columns.values(), strict=True):
+        for place, (name, cell) in enumerate(zip(columns, cells, strict=True)):
+            say(f"{'  ' if place else ''}{name}: {cell}")

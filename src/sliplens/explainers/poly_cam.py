@@ -1,7 +1,7 @@
 """Poly-CAM for a regressor: channel masks, scored by what they keep and what they remove, all of them or some."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from statistics import fmean
@@ -32,7 +32,7 @@ from sliplens.explainers.attribution import (
 from sliplens.explainers.cam import capture, find_layers, find_published_layers
 from sliplens.explainers.contract import Comparison, Method
 from sliplens.models.engines import Engine
-from sliplens.progress import report_progress
+from sliplens.progress import report_each, report_progress
 
 _PASSES = 2  # of a channel: the image with only its region, and without it
 Likeness: TypeAlias = tuple[float, float]
@@ -53,7 +53,6 @@ class _Frame:
     published: bool
     """Masks and scores of the public code."""
     engine: Engine
-    count: Callable[[int], None]
 
     @cached_property
     def masks(self) -> list[Float[Tensor, "_channels _rows _columns"]]:
@@ -77,12 +76,13 @@ class _Frame:
         # no map changes by the division, since each is normalised; it keeps clear of the floor in `combine`
         return effect / change if change else torch.zeros_like(effect)
 
-    def measure(self, channels: Int[Tensor, " some"]) -> Float[Tensor, " some"]:
-        """Score some channels, in rising order, in batches of the engine."""
+    def measure(self, channels: Int[Tensor, " some"], *, before: int = 0) -> Float[Tensor, " some"]:
+        """Score some channels, in rising order, in batches of the engine; report them after those `before`."""
         parts, points = channels.split(self.engine.batch_size // _PASSES), [self.image.new_zeros(_PASSES, 0)]
         for predictions in self.engine.run(self._blend(part) for part in parts if len(part)):
             points.append(predictions.reshape(_PASSES, -1))
-            self.count(points[-1].shape[1])
+            before += points[-1].shape[1]
+            report_progress(before, len(self.active))
         return self.supports(*torch.cat(points, dim=1))
 
     def _blend(self, channels: Int[Tensor, " some"]) -> Float[Tensor, "images colours height width"]:
@@ -157,18 +157,13 @@ class PolyCam(Method):
         if not 0 <= self.level < len(layers):
             raise InputError(f"Poly-CAM has no level {self.level} for {len(layers)} layers; count from 0, the finest")
         layers = layers[self.level :]  # a level is made of its own layer and the coarser ones
-        names, channels, done = [layer.name for layer in layers], sum(layer.shape[0] for layer in layers), 0
-
-        def count(channels_done: int) -> None:
-            nonlocal done
-            done += channels_done
-            report_progress(done, len(comparison.images) * channels)
-
+        names, channels = [layer.name for layer in layers], sum(layer.shape[0] for layer in layers)
         # one engine for all rounds and images
         passes = len(comparison.images) * round(self.budget * channels) * _PASSES
         engine = comparison.prepare(passes, engine=self.engine)
         maps, approximations, warnings = [], [], []
-        for index, image in enumerate(comparison.images):
+        for index in report_each(range(len(comparison.images)), sizes=[channels] * len(comparison.images)):
+            image = comparison.images[index]
             with capture(comparison.model, names) as outputs:
                 comparison.predict(image[None])
             empty, empty_prediction = comparison.reference[index], comparison.reference_prediction[index]
@@ -183,13 +178,10 @@ class PolyCam(Method):
                 activations=[outputs[name][0] for name in names],
                 published=self.published,
                 engine=engine,
-                count=count,
             )
-            count(channels - len(frame.active))
             approximation = None
             if self.budget < 1 and len(frame.active):
                 supports, approximation = _search(frame, budget=self.budget, likeness=self.likeness)
-                count(len(frame.active) - approximation.measured)
                 approximations.append(approximation)
             else:
                 supports = frame.measure(frame.active)
@@ -337,7 +329,8 @@ def _search(
             return
         chosen = process.choose(count, importance=widest(_importance(frame, process)))
         order = chosen.argsort()
-        process.learn(frame.measure(frame.active[chosen[order]])[order.argsort()])
+        supports = frame.measure(frame.active[chosen[order]], before=len(process.chosen) - count)
+        process.learn(supports[order.argsort()])
 
     count = max(1, math.ceil(budget * total))
     first = math.ceil(_FIRST * count)

@@ -34,6 +34,8 @@ from sliplens.recordings.trial import ContactState
 from sliplens.runner import LONGEST, MakePart, Work, require_new_table, run_table
 from sliplens.shear import DIRECTION_LIMIT, FULL_CIRCLE, range_words
 
+_REPORT_EVERY = 16
+"""Batches from one report of progress to the next, about a second."""
 _CAMERA_EVERY = 4
 """Frames of a recording of which one is compared with the reference for the camera's motion."""
 LEVEL = 0.9
@@ -391,13 +393,14 @@ class _Prediction(Work):
         encode = partial(network.encoding.encode, reference=reference, image_size=network.manifest.image_size)
 
         def batches(some: Iterator[tuple[int, Frame]], checks: list[tuple[bool, str | None]]) -> Iterator[Tensor]:
-            while batch := list(islice(some, engine.batch_size)):
-                checks.extend(check(number, frame) for number, frame in batch)
+            for number, batch in enumerate(iter(lambda: list(islice(some, engine.batch_size)), []), start=1):
+                checks.extend(check(*numbered) for numbered in batch)
                 images = np.stack([frame for _, frame in batch])
                 if images.shape[1:3] != size:
                     network.require_frame_size(images.shape[1:3])
                 yield encode(images)
-                report_progress(batch[-1][0] + 1 - first, count)
+                if not number % _REPORT_EVERY:
+                    report_progress(batch[-1][0] + 1 - first, count)
 
         for begin in range(first, first + count, LONGEST):
             checks: list[tuple[bool, str | None]] = []

@@ -47,9 +47,8 @@ def check_dataset(
     data
         Data set, or its folder.
     against
-        Data set whose trials must be others, as those of a test; on the command line also a network, to count the
-        trials that trained it. Trials are known by their frames, simulated ones by their seeds too. Days and sensors
-        of both are notes.
+        Data set whose trials must be others, as those of a test. Trials are known by their frames, simulated ones by
+        their seeds too. Days and sensors of both are notes.
 
     See Also
     --------
