@@ -96,7 +96,7 @@ def show_labelled(title: str, data: "Dataset", *, audit: bool) -> None:
         say(f"  {trial}: frames without a valid label: {reasons or 'none'}")
 
 
-def _basis(labelling: "Labelling | None") -> dict[str, str]:
+def _basis(labelling: "Labelling | None") -> dict[str, str | None]:
     """Return the cells of friction, lag and reference."""
     friction, lag, reference = "came with it", None, "its own"
     if labelling is not None and (basis := labelling.basis) is not None:
