@@ -2,19 +2,16 @@
 
 import inspect
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from importlib import import_module
-from pathlib import Path
-from typing import Any, Literal
 
 import cyclopts
 import pytest
 from command_line import refused, run
 
 import sliplens
-from sliplens.cli.app import adapt, constants, name_options, typed_kind
+from sliplens.cli.app import adapt
 from sliplens.cli.commands import COMMANDS
-from sliplens.errors import InputError
 
 NAMED = pytest.mark.parametrize("name", COMMANDS)
 
@@ -66,40 +63,6 @@ def test_the_overview_has_a_line_for_each_command(capsys: pytest.CaptureFixture[
     assert run("--help") == 0
     text = capsys.readouterr().out
     assert all(f"\n{name} " in text for name in COMMANDS)
-
-
-@pytest.mark.parametrize(
-    ("hint", "kind"),
-    [
-        (bytes | Path | str | None, str),
-        (Path | None, Path),
-        (Sequence[str], tuple[str, ...]),
-        (str | Sequence[Path | str], tuple[str, ...]),
-        (Mapping[str, float] | None, tuple[str, ...]),
-        (Literal["a", "b"] | None, Literal["a", "b"]),
-        (tuple[float, float] | None, tuple[float, float]),
-        (tuple[tuple[int, int], ...], tuple[tuple[int, int], ...]),
-        (float | tuple[float, float] | str, str),
-        (bytes, None),
-        (Callable[[int], int] | None, None),
-    ],
-    ids=str,
-)
-def test_types_become_the_simplest_that_can_be_typed(hint: Any, kind: Any):
-    assert typed_kind(hint) == kind
-
-
-def test_constants_are_names_with_numbers():
-    assert constants(["target=0.3", "down_n_s=2"]) == {"target": 0.3, "down_n_s": 2.0}
-    for text in ("target", "target=much", "=1x"):
-        with pytest.raises(InputError, match="NAME=NUMBER"):
-            constants([text])
-
-
-def test_messages_name_options_as_they_are_typed():
-    names = ["batch_size", "out"]
-    assert name_options("batch_size must be at least 1", names) == "--batch-size must be at least 1"
-    assert name_options("out of memory", names) == "out of memory"
 
 
 @pytest.mark.parametrize(

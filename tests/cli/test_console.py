@@ -7,7 +7,7 @@ from rich.console import Console
 
 from sliplens.cli import console
 from sliplens.cli.console import Terminal, print_table
-from sliplens.progress import Stages, fold_equal, open_stage, report_progress, reporting
+from sliplens.progress import Stages, open_stage, report_progress, reporting
 
 METHODS = ["Grad-CAM", "Integrated Gradients", "Poly-CAM (thesis)"]
 HEAD = ["Method", "Score D (lower is better)", "Standard deviation", "SRG, grey fill", "SRG, blurred fill", "Seconds"]
@@ -113,16 +113,3 @@ def test_a_stage_that_fails_closes_its_bar(screen: Console) -> None:
         count(1, 1)
 
     assert "1/1" in screen.export_text()
-
-
-def test_equal_messages_are_counted_in_order() -> None:
-    assert fold_equal(["b", "a", "b"]) == ["b (2 times)", "a"]
-
-
-def test_messages_that_differ_in_numbers_alone_are_one_line() -> None:
-    messages = ["grad-cam loses by 0.10", "poly-cam loses by 0.10", "grad-cam loses by -0.25", "grad-cam loses by 0.3"]
-
-    assert fold_equal(messages) == [
-        "grad-cam loses by 0.10 (and 2 more with other names or numbers)",
-        "poly-cam loses by 0.10",
-    ]

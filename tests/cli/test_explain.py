@@ -1,6 +1,5 @@
 """`sliplens explain`: the folder it makes, and what is said to mistakes."""
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from PIL import Image
 
 from sliplens.explainers.occlusion import marker_regions
 from sliplens.files import read_json
-from sliplens.images import list_images, read_image
+from sliplens.images import read_image
 from sliplens.recordings import Dataset
 from sliplens.results.explanation import load_explanation
 
@@ -47,16 +46,6 @@ def test_maps_overlays_and_a_panel(difference_run: Path, small_dataset: Dataset,
     assert 1 <= told.count("note: ") <= len(notes)  # what several methods warn of, or other numbers, is told once
     run(difference_run, small_dataset.folder, "-o", output, *QUICK, "--levels", 1, 0)
     assert "kept" in capsys.readouterr().out
-
-
-def test_without_a_method_the_recommended_one_explains(difference_run: Path, difference_folder: Path, tmp_path: Path):
-    run(difference_run, "--frames", difference_folder, "-o", tmp_path / "maps")
-    explained = load_explanation(tmp_path / "maps")
-    assert list(explained.relevance) == ["shapley"]  # difference images show no markers
-    for notes in explained.methods.values():
-        tiles, *others = notes.warnings
-        assert tiles.startswith("tiles, not markers")
-        assert all(re.match(r"[123] of 3 frames \(frame", warning) for warning in others)
 
 
 def test_a_budget_reaches_poly_cam(difference_run: Path, difference_folder: Path, tmp_path: Path, monkeypatch):
@@ -106,17 +95,3 @@ def test_markers_are_occluded_where_each_frame_has_them(
         # each marker has one value, and so has what lies between them
         assert all(np.ptp(relevance[regions == region]) == 0 for region in range(4))
         assert np.unique(relevance).size > 1
-
-
-def test_markers_are_found_in_camera_frames_only(raw_run: Path, difference_folder: Path, tmp_path: Path, monkeypatch):
-    words = ("-o", tmp_path / "maps", "--method", "occlusion-marker")
-    seen = []
-
-    def places(frame, *, image_size):
-        seen.append(frame)
-        return MARKERS
-
-    monkeypatch.setattr("sliplens.explainers.frames.markers_in_frame", places)
-    paths = list_images(difference_folder)
-    run(raw_run, "--frames", difference_folder, "--reference", paths[0], *words)
-    assert all(np.array_equal(one, read_image(path)) for one, path in zip(seen, paths, strict=True))

@@ -1,7 +1,7 @@
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from command_line import command
+from command_line import typed
 from data_sets import save_dataset
 
 from sliplens.images import write_png
@@ -30,7 +30,7 @@ def folder(tmp_path, moving):
 
 def test_a_folder_of_images_becomes_a_table_of_displacements(folder, tmp_path):
     output = tmp_path / "tracks.parquet"
-    command("track", source=folder, out=output, reference=tmp_path / "untouched.png")
+    typed("track", folder, "-o", output, "--reference", tmp_path / "untouched.png")
     table = pq.read_table(output)
     assert table.num_rows == 4 * 30
     assert set(table["status"].to_pylist()) == {"followed"}
@@ -44,7 +44,7 @@ def test_a_folder_of_images_becomes_a_table_of_displacements(folder, tmp_path):
 
 def test_without_a_reference_the_first_frame_stands_for_it_and_says_so(folder, tmp_path, capsys):
     output = tmp_path / "tracks.parquet"
-    command("track", source=folder, out=output)
+    typed("track", folder, "-o", output)
     table = pq.read_table(output)
     first = np.array(table["frame"]) == 0
     np.testing.assert_allclose(np.array(table["dx_px"])[first], 0.0, atol=1e-5)
@@ -65,7 +65,7 @@ def test_a_data_set_gives_what_the_tracker_gives(trials, tmp_path):
     trial = trials["chromatouch"]
     data = save_dataset(tmp_path / "data", trial, split="test", simulated=True).folder
     output = tmp_path / "tracks.parquet"
-    command("track", source=data, out=output, markers="chromatouch")
+    typed("track", data, "-o", output, "--markers", "chromatouch")
     table = pq.read_table(output)
     tracks = track_markers(trial.frames, trial.reference, "chromatouch")
     expected = tracks.displacement_px[..., 0].ravel().astype(np.float32)

@@ -6,7 +6,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from command_line import command
+from command_line import typed
 
 from sliplens.errors import InputError
 from sliplens.recordings import Dataset
@@ -27,10 +27,10 @@ def name_of(path: Path) -> str:
 
 
 def test_the_first_trial_is_written_unless_another_is_named(small_dataset: Dataset, tmp_path: Path, capsys):
-    for trial in (None, small_dataset.trials[3].trial):
+    for trial, words in ((0, ()), (3, ("--trial", small_dataset.trials[3].trial))):
         output = tmp_path / f"{trial}.rrd"
-        command("view", source=small_dataset.folder, trial=trial, out=output)
-        assert name_of(output) == (trial or small_dataset.trials[0].trial)
+        typed("view", small_dataset.folder, "-o", output, *words)
+        assert name_of(output) == small_dataset.trials[trial].trial
         assert f"rerun {output}" in capsys.readouterr().out.replace("\n", "")
     assert len(list(tmp_path.iterdir())) == 2
 
@@ -41,14 +41,15 @@ def test_a_table_of_predictions_finds_its_frames(small_dataset: Dataset, tmp_pat
     for source in (str(small_dataset.folder), str(tmp_path / "gone"), ""):
         pq.write_table(pa.table(rows).replace_schema_metadata({"sliplens.source": source}), table)
         if source == str(small_dataset.folder):
-            command("view", source=table, out=output)
+            typed("view", table, "-o", output)
             assert name_of(output) == "test-wet-7"
             continue
         with pytest.raises(
             InputError, match=r"which does not exist; name the source first, and the table with --predic"
         ):
-            command("view", source=table, out=tmp_path / "b.rrd")
-    command("view", source=small_dataset.folder, trial="test-wet-7", predictions=table, out=tmp_path / "b.rrd")
+            typed("view", table, "-o", tmp_path / "b.rrd")
+    words = ("--trial", "test-wet-7", "--predictions", table, "-o", tmp_path / "b.rrd")
+    typed("view", small_dataset.folder, *words)
 
 
 def test_without_an_output_the_viewer_opens(small_dataset: Dataset, monkeypatch: pytest.MonkeyPatch, tmp_path, capsys):
@@ -57,7 +58,7 @@ def test_without_an_output_the_viewer_opens(small_dataset: Dataset, monkeypatch:
 
     monkeypatch.setattr(rerun.RecordingStream, "connect_grpc", connect)
     monkeypatch.setattr("sliplens.live.viewer.start_viewer", lambda: "rerun+http://127.0.0.1:1/proxy")
-    command("view", source=small_dataset.folder, trial="test-wet-7")
+    typed("view", small_dataset.folder, "--trial", "test-wet-7")
     assert name_of(tmp_path / "sent.rrd") == "test-wet-7"
     # whoever opens it is told what it tells others
     assert "rerun analytics disable" in capsys.readouterr().out

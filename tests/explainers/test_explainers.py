@@ -8,7 +8,6 @@ from quick import QUICK, saliency
 from torch import nn
 
 from sliplens.errors import ImageError, InputError, ModelError
-from sliplens.explainers.attribution import Attribution
 from sliplens.explainers.gradients import SmoothGrad
 from sliplens.explainers.occlusion import Occlusion
 from sliplens.explainers.poly_cam import PolyCam
@@ -225,30 +224,6 @@ def test_image_equal_to_its_reference_has_nothing_to_explain(name, network, imag
     explanation = QUICK[name](network("small shufflenet"), images[:1], reference=images[:1])
     assert not explanation.influence.any()
     assert "so there is next to nothing to explain" in explanation.warnings[0]
-
-
-def explanation_of(relevance, *, prediction: float, reference: float) -> Attribution:
-    return Attribution(
-        relevance=torch.tensor([relevance]),
-        method="by hand",
-        target="f(x) - f(reference)",
-        prediction=torch.tensor([prediction]),
-        reference_prediction=torch.tensor([reference]),
-        seconds=0.0,
-    )
-
-
-@pytest.mark.parametrize(
-    ("prediction", "reference", "expected"),
-    [
-        (0.9, 0.2, [[0.5, 1.0, 0.0]]),  # the margin rose: what raises it
-        (0.2, 0.9, [[0.0, 0.0, 1.0]]),  # the margin fell: what lowers it
-        (0.5, 0.5, [[0.0, 0.0, 0.0]]),  # no change, no evidence for it
-    ],
-)
-def test_saliency_shows_the_evidence_for_the_change(prediction, reference, expected):
-    explanation = explanation_of([[0.2, 0.4, -0.1]], prediction=prediction, reference=reference)
-    torch.testing.assert_close(saliency(explanation), torch.tensor([expected]))
 
 
 def filled(value: float, *, shape=(2, 3, 8, 8)):

@@ -3,8 +3,6 @@
 import pytest
 
 from sliplens.cli import call_command, main
-from sliplens.cli.app import adapt
-from sliplens.cli.commands import COMMANDS
 
 
 def run(*words: object) -> int:
@@ -25,11 +23,6 @@ def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
 def typed(*words: object) -> None:
     """Run a command as it is typed; errors are raised instead of printed."""
     call_command([str(word) for word in words])
-
-
-def command(name: str, **options: object) -> None:
-    """Call a command with parsed options; errors are raised instead of printed."""
-    adapt(COMMANDS[name])[0](**options)
 
 
 def table_cells(out: str) -> list[list[str]]:

@@ -125,18 +125,6 @@ def test_the_time_limit_stops_a_training_and_leaves_a_whole_run(tmp_path: Path, 
     load(tmp_path / "run")
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"image_size": 16}, "image_size must be 32 to 4096, got 16"),
-        ({"batch_size": 1}, "batch_size must be 2 to 1e"),
-    ],
-)
-def test_impossible_recipes_are_refused(change: dict, message: str):
-    with pytest.raises(InputError, match=message):
-        replace(CONFIG, **change)
-
-
 def test_a_training_may_start_from_another_network(
     tmp_path: Path, frames: tuple[FrameSet, FrameSet], trained_run: Path
 ):
