@@ -155,6 +155,7 @@ def test_map_moves_with_the_image(name, network):
     places = torch.tensor([[30.0, 30.0], [40.0, 28.0], [33.0, 41.0]])
     moving = {
         "smooth-grad": lambda _: SmoothGrad(samples=1, noise=0.0),
+        "occlusion": lambda _: Occlusion(),
         "occlusion-marker": lambda at: Occlusion(markers_px=places + at - 24),
         "shapley": lambda _: Shapley(tile_px=16),
         "shapley-marker": lambda at: Shapley(markers_px=places + at - 24),

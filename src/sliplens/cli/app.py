@@ -4,14 +4,14 @@ import ast
 import inspect
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import cached_property, partial
 from importlib import import_module
 from inspect import Parameter, Signature, signature
 from itertools import pairwise
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, Union, Unpack, get_args, get_origin, get_type_hints, is_typeddict
+from typing import Annotated, Any, Literal, NamedTuple, Union, Unpack, get_args, get_origin, get_type_hints
 
 import cyclopts
 import docstring_parser
@@ -34,6 +34,8 @@ class Command:
     """Parameters with a further name, such as `("source", "--from")`."""
     suffixes: tuple[str, ...] = ()
     """Endings of the file `out`; without an ending it is a folder."""
+    out: str = ""
+    """File or folder that must be named, such as `folder of the maps`; empty where the function does without."""
 
     @cached_property
     def definition(self) -> ast.FunctionDef:
@@ -61,33 +63,13 @@ class Command:
                 require_new_file(Path(out), suffix=self.suffixes, overwrite=overwrite)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Option:
-    """A parameter on the command line."""
+class _Option(NamedTuple):
+    """An option of a command."""
 
-    name: str
-    kind: Any
-    """Type of its value: text, numbers, paths, choices, or a tuple of these."""
-    default: Any
-    help: str
-    positional: bool = False
-    group: str = ""
-    """Parameter of the function that holds it as a field of a dataclass; empty if it is a parameter itself."""
-    further: bool = False
-    """True for an option of `Command.run`."""
-
-    def parameter(self, aliases: Sequence[str]) -> Parameter:
-        """Return the parameter of the function that cyclopts calls."""
-        about = cyclopts.Parameter(
-            help=self.help,
-            alias=aliases,
-            negative=f"--no-{self.name.replace('_', '-')}" if self.default is True else (),
-            consume_multiple=get_origin(self.kind) is tuple,
-            show_default=self.default not in (None, False, True, (), Parameter.empty),
-        )
-        optional = self.kind if self.default is not None else self.kind | None
-        kind = Parameter.POSITIONAL_OR_KEYWORD if self.positional else Parameter.KEYWORD_ONLY
-        return Parameter(self.name, kind, default=self.default, annotation=Annotated[optional, about])
+    parameter: Parameter
+    """Parameter of the function that cyclopts calls."""
+    group: str
+    """Parameter of the library's function that holds it as a field of a dataclass; empty if it is one itself."""
 
 
 def adapt(command: Command) -> tuple[Callable[..., object], list[str]]:
@@ -97,63 +79,70 @@ def adapt(command: Command) -> tuple[Callable[..., object], list[str]]:
     hints = get_type_hints(function)
     for hint in [hint for hint in hints.values() if get_origin(hint) is Unpack]:
         hints |= get_type_hints(get_args(hint)[0])
-    further = _options(command.run, further=True)
-    options = sorted((*_options(function), *further), key=lambda option: 2 - option.further if option.positional else 3)
-    by_name = {option.name: option for option in options}
+    further = _options(command.run, command, skip=1)
+    options = _options(function, command) | further
+    places = {name: option.parameter.kind is not Parameter.KEYWORD_ONLY for name, option in options.items()}
+    names = sorted(options, key=lambda name: 2 - (name in further) if places[name] else 3)
 
     def call(*positional: object, **values: object) -> None:
-        values = dict(zip(by_name, positional, strict=False)) | values
-        further = {name: values.pop(name) for name in list(values) if by_name[name].further}
+        values = dict(zip(names, positional, strict=False)) | values
+        if command.out and "out" not in values:
+            example = "markers.parquet" if command.suffixes else "FOLDER"
+            raise InputError(f"name the {command.out} with -o {example}")
+        others = {name: values.pop(name) for name in further.keys() & values.keys()}
         arguments: dict[str, Any] = {"on_progress": Terminal()} if "on_progress" in hints else {}
         groups: dict[str, dict[str, Any]] = {}
         for name, value in values.items():
-            if group := by_name[name].group:
+            if group := options[name].group:
                 groups.setdefault(group, {})[name] = value
             else:
                 numbers = any(_is_constants(member) for member in _members(hints[name]))
                 arguments[name] = constants(value) if numbers else value
         arguments |= {group: _options_type(hints[group])(**settings) for group, settings in groups.items()}
-        command.run(partial(function, **arguments), **further)
+        command.run(partial(function, **arguments), **others)
 
     parsed = docstring_parser.parse(function.__doc__ or "")
     texts = [parsed.short_description, parsed.long_description, f"Example: {command.example}"]
-    parameters = [option.parameter(command.names_of(option.name)) for option in options]
+    parameters = [options[name].parameter for name in names]
     call.__doc__ = "\n\n".join(filter(None, texts))
     call.__signature__ = Signature(parameters)  # pyright: ignore[reportFunctionMemberAccess]
     call.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    return call, list(by_name)
+    return call, names
 
 
-def _options(kind: Any, *, further: bool = False, group: str = "") -> list[_Option]:
+def _options(kind: Any, command: Command, *, skip: int = 0, group: str = "") -> dict[str, _Option]:
     """Return the parameters of a function, or the fields of a dataclass or TypedDict, that can be typed.
 
-    If `further`, those of `Command.run` besides the call. Fields of dataclasses are options of their own.
+    The first `skip` are left out. Fields of dataclasses are options of their own.
     """
     helps, hints, options = _parameter_help(kind), get_type_hints(kind), dict[str, _Option]()
-    if is_typeddict(kind):
+    if inspect.isclass(kind) and issubclass(kind, dict):  # a TypedDict
         parameters = {name: Parameter(name, Parameter.KEYWORD_ONLY, default=None) for name in hints}
     else:
         parameters = signature(kind).parameters
-    for name, parameter in list(parameters.items())[further:]:
-        hint, default, nested = hints.get(name, Any), parameter.default, []
+    for name, parameter in list(parameters.items())[skip:]:
+        hint, default, nested = hints.get(name, Any), parameter.default, {}
         typed, record = typed_kind(hint), _options_type(hint)
         if typed is not None:
-            options[name] = _Option(
-                name=name,
-                kind=typed,
-                default=(default,) if isinstance(default, str) and get_origin(typed) is tuple else default,
+            several = get_origin(typed) is tuple
+            default = (default,) if isinstance(default, str) and several else default
+            about = cyclopts.Parameter(
                 help=helps.get(name, ""),
-                positional=parameter.kind is Parameter.POSITIONAL_OR_KEYWORD,
-                group=group,
-                further=further,
+                alias=command.names_of(name),
+                negative=f"--no-{name.replace('_', '-')}" if default is True else (),
+                consume_multiple=several,
+                show_default=default not in (None, False, True, (), Parameter.empty),
             )
+            optional = Annotated[typed if default is not None else typed | None, about]
+            positional = parameter.kind is Parameter.POSITIONAL_OR_KEYWORD and not group
+            place = parameter.kind if positional else Parameter.KEYWORD_ONLY
+            options[name] = _Option(Parameter(name, place, default=default, annotation=optional), group)
         elif parameter.kind is Parameter.VAR_KEYWORD:
-            nested = _options(*get_args(hint))
+            nested = _options(get_args(hint)[0], command)
         elif record is not None and (not inspect.isclass(kind) or record.__name__.endswith("Options")):
-            nested = _options(record, group=name)
-        for option in nested:
-            options.setdefault(option.name, replace(option, further=further))
-    return list(options.values())
+            nested = _options(record, command, group=name)
+        options |= {name: option for name, option in nested.items() if name not in options}
+    return options
 
 
 def _parameter_help(kind: Any) -> dict[str, str]:

@@ -27,23 +27,17 @@ Run = Callable[..., None]
 
 
 def command(
-    name: str, function: str, example: str, *aliases: tuple[str, str], suffixes: tuple[str, ...] = ()
+    name: str, function: str, example: str, *aliases: tuple[str, str], out: str = "", suffixes: tuple[str, ...] = ()
 ) -> Callable[[Run], Run]:
     """Register a function that calls a function of the library, given with its arguments, and prints the result."""
 
     def register(run: Run) -> Run:
-        options = {"aliases": aliases, "suffixes": suffixes}
-        COMMANDS[name] = Command(function=f"sliplens.{function}", run=run, example=example, **options)
+        COMMANDS[name] = Command(
+            function=f"sliplens.{function}", run=run, example=example, aliases=aliases, out=out, suffixes=suffixes
+        )
         return run
 
     return register
-
-
-def require_out(call: Any, what: str, *, example: str = "FOLDER") -> Path:
-    """Return the path that a command writes; refuse a command without one."""
-    if "out" not in call.keywords:
-        raise InputError(f"name the {what} with -o {example}")
-    return Path(call.keywords["out"])
 
 
 class _Log:
@@ -186,10 +180,14 @@ def call_sensor_new(call: Any) -> None:
     print_file(path.with_suffix(".png"), "what the profile does to a frame")
 
 
-@command("simulate", "simulation.trials:simulate", "sliplens simulate runs/mine/data --preset small")
+@command(
+    "simulate",
+    "simulation.trials:simulate",
+    "sliplens simulate runs/mine/data --preset small",
+    out="folder of the data set",
+)
 def call_simulate(call: Any) -> None:
     """Print the splits."""
-    require_out(call, "folder of the data set")
     frames: dict[str, list[int]] = {}
     for trial in call().trials:
         frames.setdefault(trial.split, []).append(trial.frames)
@@ -321,13 +319,18 @@ def call_view(call: Any) -> None:
         print_file(Path(out), f"{about}; open it with `rerun {out}`")
 
 
-@command("track", "markers.tracking:track", "sliplens track cup.mp4 --reference untouched.png -o markers.parquet")
+@command(
+    "track",
+    "markers.tracking:track",
+    "sliplens track cup.mp4 --reference untouched.png -o markers.parquet",
+    out="table to write",
+    suffixes=(".parquet",),
+)
 def call_track(call: Any) -> None:
     """Print how many markers were followed."""
     from sliplens.recordings.sensor import load_profile
 
     arguments = call.keywords
-    require_out(call, "table to write", example="markers.parquet")
     if "markers" not in arguments and "sensor" in arguments:
         arguments["markers"] = load_profile(arguments["sensor"]).markers or "auto"
     tracking = call()
@@ -340,13 +343,14 @@ def call_track(call: Any) -> None:
     "train",
     "training.fitting:train",
     "sliplens train runs/mine/data -o runs/mine/train --start-from chromatouch-pair --epochs 5",
+    out="folder of the network",
 )
 def call_train(call: Any) -> None:
     """Draw the learning curve."""
     from sliplens.plots.figure import plot
     from sliplens.plots.style import save_page
 
-    picture, network = require_out(call, "folder of the network") / "curves.png", call()
+    picture, network = Path(call.keywords["out"]) / "curves.png", call()
     if network.training is not None and not picture.is_file():
         save_page(plot(network), picture)
 
@@ -421,16 +425,13 @@ def call_export_onnx(call: Any) -> None:
     print_file(path, "predicts as the network does")
 
 
-@command(
+command(
     "explain",
     "study.explaining:explain",
     "sliplens explain runs/mine/train runs/mine/data -o runs/mine/explain",
     ("source", "--frames"),
-)
-def call_explain(call: Any) -> None:
-    """Write the maps."""
-    require_out(call, "folder of the maps")
-    call()
+    out="folder of the maps",
+)(lambda call: call())
 
 
 command("score", "study.scoring:score", "sliplens score runs/mine/train runs/mine/explain -o runs/mine/score")(
@@ -444,12 +445,12 @@ command("score", "study.scoring:score", "sliplens score runs/mine/train runs/min
     "sliplens study runs/mine/data --network runs/mine/train -o runs/mine/study --on processes=2",
     ("networks", "--network"),
     ("methods", "--method"),
+    out="folder of the study",
 )
 def call_study(call: Any) -> None:
     """Draw the page."""
-    out = require_out(call, "folder of the study")
     call()
-    output.draw_report(out)
+    output.draw_report(call.keywords["out"])
 
 
 @command(
@@ -457,13 +458,14 @@ def call_study(call: Any) -> None:
     "grip.episodes:run_episodes",
     "sliplens grip -o runs/grip --object egg --rendered",
     ("settings", "--set"),
+    out="folder to make",
 )
 def call_grip(call: Any) -> None:
     """Print what became of the episodes, and draw the first."""
     from sliplens.plots.figure import plot
     from sliplens.plots.style import save_page
 
-    out = require_out(call, "folder to make")
+    out = Path(call.keywords["out"])
     grip = call(out=out / "grip")
     save_page(plot(grip), out / "grip.png")
     output.print_grip(grip)

@@ -3,7 +3,7 @@
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sliplens.cli.console import Terminal, print_file, print_table, say
 from sliplens.progress import fold_equal, number_of
@@ -33,8 +33,15 @@ def show_predictions(predictions: "Predictions") -> None:
     rows = []
     for row in table.to_pylist() if predictions.frames <= _MOST_ROWS else ():
         frame = row.get("file") or f"{row['trial']} {row['frame']}"
-        truth = {"true": _percent(row.get("safety_margin")), "known": _percent(row.get("known"))}
-        rows.append({"frame": frame, **_margin(row, "safety margin", "withheld"), **truth})
+        rows.append(
+            {
+                "frame": frame,
+                "safety margin": _percent(row["prediction"]) or "withheld",
+                "90 % interval": _interval(row["low_90"], row["high_90"]),
+                "true": _percent(row.get("safety_margin")),
+                "known": _percent(row.get("known")),
+            }
+        )
     if rows:
         print_table("Safety margins", rows)
         return
@@ -48,7 +55,8 @@ def show_predictions(predictions: "Predictions") -> None:
         rows.append(
             {
                 "trial": name,
-                **_margin(row, "lowest", "none"),
+                "lowest": _percent(row.get("prediction")) or "none",
+                "90 % interval": _interval(row.get("low_90"), row.get("high_90")),
                 "at": lowest and f"frame {lowest}" if time_s is None else f"{time_s:.2f} s",
                 "frames": len(trial),
                 "touch": int(trial["touches"].to_numpy().sum()) if "touches" in trial.column_names else None,
@@ -64,11 +72,8 @@ def _percent(value: float | None) -> str | None:
     return None if value is None else f"{100 * value:.0f} %"
 
 
-def _margin(row: dict[str, Any], name: str, unknown: str) -> dict[str, str | None]:
-    """Return the cells of a margin and its interval."""
-    low, high = row.get("low_90"), row.get("high_90")
-    interval = None if low is None or high is None else f"{100 * low:.0f} to {100 * high:.0f} %"
-    return {name: _percent(row.get("prediction")) or unknown, "90 % interval": interval}
+def _interval(low: float | None, high: float | None) -> str | None:
+    return None if low is None or high is None else f"{100 * low:.0f} to {100 * high:.0f} %"
 
 
 def show_labelled(title: str, data: "Dataset", *, audit: bool) -> None:

@@ -16,7 +16,7 @@ from sliplens.models.checkpoint import Estimate
 from sliplens.models.sequence import require_frequent
 from sliplens.models.wrapping import open_run
 from sliplens.progress import OnProgress, add_note, open_stage, report_file, reporting
-from sliplens.recordings import Dataset, TrialInfo
+from sliplens.recordings import Dataset
 from sliplens.recordings.dataset import load_dataset
 from sliplens.results.evaluation import (
     BinScore,
@@ -93,7 +93,10 @@ def evaluate(
             frames = load_frames(data, trials, encoding=network.encoding, image_size=network.manifest.image_size)
         with open_stage("Predicting frames"):
             evaluation = evaluate_frames(network, frames, split=split, friction=prior, sequence=sequence)
-        return replace(evaluation, known_trials=len(find_training_trials(trials, network)))
+        # trials that trained or validated the network, or the one it started from, by hashes of their files
+        return replace(
+            evaluation, known_trials=sum(trial.sha256[:12] in network.manifest.trained_on for trial in trials)
+        )
 
     with reporting(on_progress):
         doubts = network.doubts(friction=prior if isinstance(prior, Friction) else None)
@@ -119,11 +122,6 @@ def evaluate(
                 save_result(evaluation, output.folder)
         report_file(Path(out), "scores and predictions", kept=output.complete)
         return evaluation
-
-
-def find_training_trials(trials: Sequence[TrialInfo], network: Network) -> tuple[TrialInfo, ...]:
-    """Find the trials that trained or validated a network, or the network it started from, by hashes of their files."""
-    return tuple(trial for trial in trials if trial.sha256[:12] in network.manifest.trained_on)
 
 
 def evaluate_frames(
