@@ -47,12 +47,6 @@ def test_numbers_stand_to_the_right_and_words_to_the_left(screen: Console) -> No
     assert "│   - │            │\n" in text
 
 
-def test_brackets_in_a_table_are_text(screen: Console) -> None:
-    print_table("Scores", [{"Method": "[red]", "D": 1}])
-
-    assert "[red]" in screen.export_text()
-
-
 HOSTILE = "cup[/][red]\x1b[2J\x1b]0;owned\x07\r\n\u202egnp.tac\udc80"
 
 

@@ -101,7 +101,6 @@ def gap() -> nn.Module:
 
 NETWORKS: dict[str, Callable[[], nn.Module]] = {
     "shufflenet": lambda: shufflenet(models.shufflenet_v2_x1_0(weights=None)),
-    "half shufflenet": lambda: shufflenet(models.shufflenet_v2_x0_5(weights=None)),
     "small shufflenet": lambda: shufflenet(models.ShuffleNetV2([1, 1, 1], [8, 8, 16, 16, 24])),
     "mobilenet": mobilenet,  # its maps have both signs
     "resnet": resnet,

@@ -1,6 +1,7 @@
 """A made-up workspace: the files that the stages write, with plausible numbers and nothing measured."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ import numpy as np
 
 from sliplens.codec import save_record, save_result
 from sliplens.faithfulness.scoring import score_deletion
-from sliplens.files import Provenance
+from sliplens.files import Provenance, machine, versions
 from sliplens.recordings import TrialInfo
 from sliplens.recordings.dataset import write_dataset_table
 from sliplens.results.evaluation import Evaluation, LearningCurve, ScoredFrames, Training
@@ -25,14 +26,8 @@ FALL = {"grad-cam": 0.25, "integrated-gradients": 0.15, "poly-cam": 0.08, "rando
 def write_run(folder: Path, stage: str, config: dict[str, Any], result: object, *, minute: int = 0) -> Path:
     """A stage's folder with `run.json` and its result, a record or what JSON holds of one."""
     folder.mkdir(parents=True)
-    provenance = Provenance(
-        stage=stage,
-        config=config,
-        config_hash=stage.encode().hex(),
-        versions={"sliplens": "0.1.0", "python": "3.12.1", "torch": "2.9.0", "numpy": "2.3.1"},
-        machine={"system": "Linux", "processor": "x86_64", "cores": 2, "implementation": "cpython"},
-        finished=f"2026-11-21T04:{minute:02d}:00+00:00",
-    )
+    facts = {"versions": versions(), "machine": machine(), "finished": f"2026-11-21T04:{minute:02d}:00+00:00"}
+    provenance = Provenance(stage=stage, config=config, config_hash=stage.encode().hex(), **facts)
     save_record(provenance, folder / "run.json")
     if is_dataclass(result):
         save_result(result, folder)
@@ -42,20 +37,10 @@ def write_run(folder: Path, stage: str, config: dict[str, Any], result: object, 
 
 
 def write_simulation(workspace: Path) -> Path:
-    splits = {"train": (40, 40, "dry"), "validation": (8, 40, "dry"), "test": (16, 40, "wet")}
+    facts = {"sensor": "chromatouch-1", "day": 1, "frames": 40, "height": 224, "width": 224, "sha256": "0" * 64}
     trials = [
-        TrialInfo(
-            trial=f"{split}-{number:03d}",
-            sensor="chromatouch-1",
-            day=1,
-            condition=condition,
-            split=split,
-            frames=frames,
-            height=224,
-            width=224,
-            sha256="0" * 64,
-        )
-        for split, (count, frames, condition) in splits.items()
+        TrialInfo(trial=f"{split}-{number:03d}", condition=condition, split=split, **facts)
+        for split, count, condition in (("train", 40, "dry"), ("validation", 8, "dry"), ("test", 16, "wet"))
         for number in range(count)
     ]
     folder = write_run(workspace / "data", "simulate", {"trials": 64, "seed": 0, "size": [224, 224]}, {})
@@ -164,6 +149,22 @@ def picture_and_maps(
     return (255 * image).astype(np.uint8), {key: (one - one.min()) / np.ptp(one) for key, one in maps.items()}
 
 
+def frames_named(
+    ids: Sequence[str], margins: Sequence[float | None], predictions: Sequence[float], *, condition: str = "dry"
+) -> tuple[ExplainedFrame, ...]:
+    return tuple(
+        ExplainedFrame(
+            id=frame_id,
+            trial=frame_id.rpartition("-")[0] or frame_id,
+            condition=condition,
+            safety_margin=margin,
+            prediction=prediction,
+            reference_prediction=1.0,
+        )
+        for frame_id, margin, prediction in zip(ids, margins, predictions, strict=True)
+    )
+
+
 def write_explanation(
     workspace: Path, name: str, source: str, *, size: int, rng: np.random.Generator, condition: str = "dry"
 ) -> Path:
@@ -173,21 +174,10 @@ def write_explanation(
         f"{'day4' if source == 'simulated' else 'real'}-dry-{place:03d}-f{int(40 * (1 - m)):03d}"
         for place, m in enumerate(margins)
     ]
-    frames = tuple(
-        ExplainedFrame(
-            id=frame_id,
-            trial=frame_id.rpartition("-")[0],
-            condition=condition,
-            safety_margin=margin,
-            prediction=float(np.clip(margin + rng.normal(0, noise), 0, 1.05)),
-            reference_prediction=1.0,
-        )
-        for frame_id, margin in zip(ids, margins, strict=True)
-    )
+    predictions = [float(np.clip(margin + rng.normal(0, noise), 0, 1.05)) for margin in margins]
+    frames = frames_named(ids, margins, predictions, condition=condition)
     seconds = {"grad-cam": 0.031, "integrated-gradients": 0.42, "poly-cam": 3.1}
-    warned = (
-        {"integrated-gradients": ("completeness gap 1.8 % on 2 frames",)} if name == "raw" and source == "real" else {}
-    )
+    warned = {"integrated-gradients": ("completeness gap 1.8 % on 2 frames",) * (name == "raw" and source == "real")}
     drawn = [picture_and_maps(margin, name, size=size, rng=rng) for margin in margins]
     saliency = {key: np.stack([maps[key] for _, maps in drawn]).astype(np.float32) for key in METHODS}
     return write_run(
@@ -231,17 +221,7 @@ def explained(
 
 
 def write_score(workspace: Path, name: str, *, size: int, rng: np.random.Generator) -> Path:
-    frames = tuple(
-        ExplainedFrame(
-            id=f"f{number:03d}",
-            trial=f"f{number:03d}",
-            condition="dry",
-            safety_margin=None,
-            prediction=0.0,
-            reference_prediction=1.0,
-        )
-        for number in range(12)
-    )
+    frames = frames_named([f"f{number:03d}" for number in range(12)], [None] * 12, [0.0] * 12)
     last, removed = 0.25 if name == "difference" else 0.45, np.arange(1, size + 1) / size
     answers = {}
     for method, fall in FALL.items():
