@@ -17,11 +17,10 @@ import pytest
 import torch
 from dots import draw_dots, make_grid
 from hypothesis import settings
-from small import make_recording, save_untrained
+from small import CALIBRATION, TRACTION, make_recording, save_untrained
 
 from sliplens.images import absolute_difference, write_png
 from sliplens.models import load, save_checkpoint
-from sliplens.models.calibration import Calibration, Traction
 from sliplens.models.sequence import SequenceHead, SequenceManifest
 from sliplens.recordings import Dataset, Recording
 from sliplens.runner import EXECUTORS
@@ -118,24 +117,19 @@ def fine_dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 @pytest.fixture(scope="session")
 def ratio_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A network of the ChromaTouch that answers with the margin and with F_t / F_n."""
-    calibration = Calibration(temperature=1.0, offsets={"0.9": 0.05}, frames=100, mse=0.01)
-    friction = tuple(0.15 + 0.105 * part for part in range(11))
-    traction = Traction(calibration=calibration, known_friction=calibration, friction=friction)
-    return save_untrained(tmp_path_factory.mktemp("ratio-run"), frame_size=224, traction=traction)
+    return save_untrained(tmp_path_factory.mktemp("ratio-run"), frame_size=224, traction=TRACTION)
 
 
 @pytest.fixture(scope="session")
 def sequence_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A network with two answers and a head for several frames, all of random weights."""
-    sure = Calibration(temperature=1.0, offsets={"0.9": 0.02}, frames=100, mse=0.01)
-    traction = Traction(calibration=sure, known_friction=sure, friction=(0.2, 0.7, 1.2))
-    folder = save_untrained(tmp_path_factory.mktemp("sequence") / "run", traction=traction)
+    folder = save_untrained(tmp_path_factory.mktemp("sequence") / "run", traction=TRACTION)
     alone = load(folder)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(3)
         head = SequenceHead(alone.model.get_buffer("edges"), alone.model.get_buffer("ratio_edges"))
         torch.nn.init.normal_(head.correction.weight)
-    manifest = replace(alone.manifest, sequence=SequenceManifest(calibration=sure, mse_one=0.02))
+    manifest = replace(alone.manifest, sequence=SequenceManifest(calibration=CALIBRATION, mse_one=0.02))
     save_checkpoint(folder, alone.model, manifest, sequence=head)
     return folder
 

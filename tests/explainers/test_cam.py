@@ -62,15 +62,7 @@ def test_images_and_references_share_a_pass(network, images):
     assert counted.batches == [1, 3 + 1]  # the search for layers; the images and the reference that all share
     counted.batches.clear()
     GradCam()(counted, images, reference=images)
-    assert counted.batches == [3 + 3]
-
-
-def test_a_network_that_was_changed_is_searched_anew(network, images):
-    model = network("small shufflenet")
-    GradCam()(model, images[:1])
-    model.conv5 = nn.Sequential()  # hands its input on
-    model.fc = nn.Linear(16, 1).double()
-    assert "through layer stage4" in GradCam()(model, images[:1]).target
+    assert counted.batches == [1, 3 + 3]
 
 
 def test_the_published_map_does_not_depend_on_the_reference(network, images, reference):

@@ -14,6 +14,10 @@ from sliplens.recordings import ContactState, Recording
 
 FRAME_SIZE = 48
 IMAGE_SIZE = 32
+CALIBRATION = Calibration(temperature=1.0, offsets={"0.68": 0.02, "0.9": 0.05}, frames=100, mse=0.01)
+TRACTION = Traction(
+    calibration=CALIBRATION, known_friction=CALIBRATION, friction=tuple(0.15 + 0.105 * part for part in range(11))
+)
 
 
 def make_recording(trial: str, *, condition: str = "dry", day: int = 1, frames: int = 12, seed: int = 0) -> Recording:

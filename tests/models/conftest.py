@@ -4,19 +4,14 @@ from pathlib import Path
 
 import pytest
 import torch
-from small import IMAGE_SIZE, save_untrained
+from small import CALIBRATION, IMAGE_SIZE, TRACTION, save_untrained
 from torch import Tensor, nn
 from torch.nn import functional
 
 from sliplens.models import Network, load
 from sliplens.models.backbones import HistogramRegressor
-from sliplens.models.calibration import Calibration, Traction
 from sliplens.models.onnx import export_onnx
 
-CALIBRATION = Calibration(temperature=1.0, offsets={"0.68": 0.02, "0.9": 0.05}, frames=100, mse=0.01)
-TRACTION = Traction(
-    calibration=CALIBRATION, known_friction=CALIBRATION, friction=tuple(0.15 + 0.105 * part for part in range(11))
-)
 HEADS = ("point", "histogram", "margin-and-ratio")
 
 

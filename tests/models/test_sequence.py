@@ -6,19 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from small import CALIBRATION
 from there import there
 
 import sliplens as sl
 from sliplens.errors import InputError
 from sliplens.models import Network, Ratio, load
-from sliplens.models.calibration import Calibration
 from sliplens.models.checkpoint import Estimate
 from sliplens.recordings import Dataset
 from sliplens.recordings.source import open_source
 from sliplens.recordings.trial import ContactState
 
 EDGES, RATIO_EDGES = torch.linspace(-0.1, 1.1, 61), torch.linspace(-0.1, 1.5, 81)
-SURE = Calibration(temperature=1.0, offsets={"0.9": 0.02}, frames=100, mse=0.01)
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +32,7 @@ def answers(frames: int, *, seed: int = 0) -> Estimate:
     margin = rng.dirichlet(np.full(60, 0.3), frames)
     ratio = Ratio(probabilities=rng.dirichlet(np.full(80, 0.3), frames), edges=ratio_edges)
     mean = margin @ ((edges[1:] + edges[:-1]) / 2)
-    return Estimate(margin=mean, calibration=SURE, probabilities=margin, edges=edges, ratio=ratio)
+    return Estimate(margin=mean, calibration=CALIBRATION, probabilities=margin, edges=edges, ratio=ratio)
 
 
 def follow(run: Network, estimate: Estimate, *, pieces: int = 1, touches: np.ndarray | None = None) -> np.ndarray:

@@ -6,12 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from small import save_untrained
+from small import TRACTION, save_untrained
 from there import there
 
 from sliplens.errors import InputError, ModelError
 from sliplens.models import load
-from sliplens.models.calibration import Calibration, Traction
 from sliplens.models.sequence import GAP_S
 from sliplens.recordings import Dataset
 from sliplens.training import evaluate, train
@@ -20,9 +19,7 @@ from sliplens.training.sequence import TrialOutputs
 
 @pytest.fixture(scope="module")
 def start(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    calibration = Calibration(temperature=1.0, offsets={"0.9": 0.05}, frames=100, mse=0.01)
-    traction = Traction(calibration=calibration, known_friction=calibration, friction=(0.2, 0.7, 1.2))
-    return save_untrained(tmp_path_factory.mktemp("start") / "run", traction=traction)
+    return save_untrained(tmp_path_factory.mktemp("start") / "run", traction=TRACTION)
 
 
 def teach(data: Dataset, start: Path, out: Path | None = None, **changes):

@@ -1,6 +1,5 @@
 """Class activation maps that keep their sign, and the activations that they weigh."""
 
-import weakref
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -68,17 +67,13 @@ def find_layers(model: nn.Module, images: Float[Tensor, "batch colours height wi
     The network is run once, with one image, and its main path followed, not into blocks and their branches but into
     plain `Sequential` containers, wrappers whose output is no map, and blocks that shrink the map by more than two.
     Each resolution and width gives its last map; layers without parameters (pooling) and 1 x 1 maps are left out. For
-    TorchVision's ShuffleNetV2 these are conv1, stage2, stage3, stage4 and conv5. They are cached per model, its modules
-    and the image size, since the pass is expensive.
+    TorchVision's ShuffleNetV2 these are conv1, stage2, stage3, stage4 and conv5.
 
     Raises
     ------
     ModelError
         If the network has no layer with a map, or maps with the channels last, such as a Swin transformer.
     """
-    key = (tuple((name, weakref.ref(module)) for name, module in model.named_modules()), tuple(images.shape[1:]))
-    if model in _LAYER_CACHE and _LAYER_CACHE[model][0] == key:
-        return _LAYER_CACHE[model][1]
     path, layers = _main_path(_record(model, images)), []
     if any(_is_channels_last(step) for step in path):
         raise ModelError(
@@ -95,11 +90,7 @@ def find_layers(model: nn.Module, images: Float[Tensor, "batch colours height wi
             f"{type(model).__name__} has no layer with a spatial map for images of {images.shape[-2]} x "
             f"{images.shape[-1]} pixels; use larger images, a convolutional network, or integrated gradients"
         )
-    _LAYER_CACHE[model] = key, tuple(layers)
     return tuple(layers)
-
-
-_LAYER_CACHE: weakref.WeakKeyDictionary[nn.Module, tuple[object, tuple[Layer, ...]]] = weakref.WeakKeyDictionary()
 
 
 def find_published_layers(model: nn.Module, images: Float[Tensor, "batch colours height width"]) -> tuple[Layer, ...]:

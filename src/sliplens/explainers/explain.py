@@ -91,11 +91,7 @@ class MethodMaps:
     """Maps of some frames by one method."""
 
     relevance: Annotated[Float32[np.ndarray, "frames height width"], ANSWER]
-    seconds: float
-    warnings: tuple[str, ...]
-    target: str
-    raises_only: bool
-    completeness_gap: tuple[float, ...] | None
+    notes: MethodNotes
 
 
 _PASSES_A_MAP = 300
@@ -121,14 +117,14 @@ def explain_rows(
     for row, values in zip(rows, relevance, strict=True):
         require_saliency(values, inputs.shape[-2:], where=f"the map of {chosen.ids[row]} by {attribution.method}")
     gap = attribution.completeness_gap
-    return MethodMaps(
-        relevance=relevance,
-        seconds=attribution.seconds,
+    notes = MethodNotes(
+        seconds_per_frame=attribution.seconds / len(rows),
         warnings=attribution.warnings,
         target=attribution.target,
         raises_only=attribution.raises_only,
         completeness_gap=None if gap is None else tuple(gap.tolist()),
     )
+    return MethodMaps(relevance=relevance, notes=notes)
 
 
 def explain_frames(
@@ -192,7 +188,7 @@ def _notes(pieces: Sequence[MethodMaps], ids: Sequence[str], warnings: Sequence[
     first = 0
     for piece in pieces:
         names = ids[first : first + len(piece.relevance)]
-        for warning in piece.warnings:
+        for warning in piece.notes.warnings:
             match = re.match(r"image (\d+): ", warning)
             text = warning if match is None else warning[match.end() :]
             frames_of.setdefault(text, []).extend(names if match is None else [names[int(match[1])]])
@@ -202,12 +198,11 @@ def _notes(pieces: Sequence[MethodMaps], ids: Sequence[str], warnings: Sequence[
         more = ", \N{HORIZONTAL ELLIPSIS}" if len(names) > _MOST_NAMES else ""
         some = ", ".join(names[:_MOST_NAMES])
         texts.append(f"{len(names)} of {number_of(len(ids), 'frame')} ({some}{more}): {text}")
-    gaps = [piece.completeness_gap for piece in pieces]
-    return MethodNotes(
-        seconds_per_frame=sum(piece.seconds for piece in pieces) / len(ids),
+    gaps = [piece.notes.completeness_gap for piece in pieces]
+    return replace(
+        pieces[0].notes,
+        seconds_per_frame=sum(piece.notes.seconds_per_frame * len(piece.relevance) for piece in pieces) / len(ids),
         warnings=tuple(texts),
-        target=pieces[0].target,
-        raises_only=pieces[0].raises_only,
         completeness_gap=None if None in gaps else sum((gap for gap in gaps if gap is not None), ()),
     )
 
