@@ -55,18 +55,18 @@ def test_the_stages_one_by_one(
     assert "other settings" in refused(capsys, *train, "--seed", 1)
 
 
-def test_an_interruption_says_how_to_go_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys):
-    def interrupt(workspace: Path) -> None:
-        raise KeyboardInterrupt
+@pytest.mark.parametrize(
+    ("error", "code", "words"),
+    [
+        (KeyboardInterrupt(), 130, "run the same command again to continue"),
+        (OSError(28, "No space left on device", "a.npz"), 2, "a.npz could not be read or written (No space left on"),
+    ],
+)
+def test_whatever_ends_a_command_is_one_sentence(error, code: int, words: str, monkeypatch, tmp_path: Path, capsys):
+    def stop(workspace: Path) -> None:
+        raise error
 
-    monkeypatch.setattr("sliplens.report.page.write_report", interrupt)
-    assert run("report", tmp_path) == 130
-    assert "run the same command again to continue" in capsys.readouterr().err
-
-
-def test_a_full_disk_is_one_sentence(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys):
-    def full(workspace: Path) -> None:
-        raise OSError(28, "No space left on device", "maps.npz")
-
-    monkeypatch.setattr("sliplens.report.page.write_report", full)
-    assert "maps.npz could not be read or written (No space left on device)" in refused(capsys, "report", tmp_path)
+    monkeypatch.setattr("sliplens.report.page.write_report", stop)
+    assert run("report", tmp_path) == code
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert words in line
