@@ -56,17 +56,17 @@ def test_the_stages_one_by_one(
 
 
 @pytest.mark.parametrize(
-    ("error", "code", "words"),
+    ("error", "told"),
     [
-        (KeyboardInterrupt(), 130, "run the same command again to continue"),
-        (OSError(28, "No space left on device", "a.npz"), 2, "a.npz could not be read or written (No space left on"),
+        (KeyboardInterrupt(), (130, "run the same command again to continue")),
+        (OSError(28, "No space left on device", "a.npz"), (2, "a.npz could not be read or written (No space left on")),
     ],
 )
-def test_whatever_ends_a_command_is_one_sentence(error, code: int, words: str, monkeypatch, tmp_path: Path, capsys):
+def test_whatever_ends_a_command_is_one_sentence(error, told: tuple[int, str], monkeypatch, tmp_path: Path, capsys):
     def stop(workspace: Path) -> None:
         raise error
 
     monkeypatch.setattr("sliplens.report.page.write_report", stop)
-    assert run("report", tmp_path) == code
+    assert run("report", tmp_path) == told[0]
     (line,) = capsys.readouterr().err.strip().splitlines()
-    assert words in line
+    assert told[1] in line
