@@ -7,46 +7,25 @@ from sliplens.errors import ModelError
 from sliplens.explainers.cam import capture, find_layers
 from sliplens.models import build_model
 
+LAYERS = {
+    "shufflenet_v2_x1_0": "conv1 24 112, stage2 116 28, stage3 232 14, stage4 464 7, conv5 1024 7",
+    "resnet18": "relu 64 112, layer1 64 56, layer2 128 28, layer3 256 14, layer4 512 7",
+    "mobilenet_v3_small": (
+        "features.0 16 112, features.1 16 56, features.3 24 28, features.6 40 14, features.8 48 14, features.11 96 7, "
+        "features 576 7"
+    ),
+    # the last map before each pooling
+    "vgg11": "features.1 64 224, features.4 128 112, features.9 256 56, features.14 512 28, features.19 512 14",
+}
+"""Layers of TorchVision's networks: name, channels and side of the map."""
 
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    [
-        (
-            "shufflenet_v2_x1_0",
-            [("conv1", 24, 112), ("stage2", 116, 28), ("stage3", 232, 14), ("stage4", 464, 7), ("conv5", 1024, 7)],
-        ),
-        (
-            "resnet18",
-            [("relu", 64, 112), ("layer1", 64, 56), ("layer2", 128, 28), ("layer3", 256, 14), ("layer4", 512, 7)],
-        ),
-        (
-            "mobilenet_v3_small",
-            [
-                ("features.0", 16, 112),
-                ("features.1", 16, 56),
-                ("features.3", 24, 28),
-                ("features.6", 40, 14),
-                ("features.8", 48, 14),
-                ("features.11", 96, 7),
-                ("features", 576, 7),
-            ],
-        ),
-        (
-            "vgg11",  # the last map before each pooling
-            [
-                ("features.1", 64, 224),
-                ("features.4", 128, 112),
-                ("features.9", 256, 56),
-                ("features.14", 512, 28),
-                ("features.19", 512, 14),
-            ],
-        ),
-    ],
-)
-def test_finds_the_last_map_of_each_resolution_and_width(name, expected):
+
+@pytest.mark.parametrize("name", LAYERS)
+def test_finds_the_last_map_of_each_resolution_and_width(name):
     with torch.device("meta"):  # shapes without arithmetic
         layers = find_layers(getattr(models, name)(weights=None), torch.zeros(1, 3, 224, 224))
-    assert [(layer.name, layer.shape) for layer in layers] == [(name, (c, side, side)) for name, c, side in expected]
+    assert ", ".join(f"{layer.name} {layer.shape[0]} {layer.shape[1]}" for layer in layers) == LAYERS[name]
+    assert all(layer.shape[1] == layer.shape[2] for layer in layers)
 
 
 def test_finds_layers_before_functional_pooling(network, images):

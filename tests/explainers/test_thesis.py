@@ -14,25 +14,14 @@ from sliplens.explainers.cam import find_layers, find_published_layers
 from sliplens.explainers.poly_cam import PolyCam
 from sliplens.explainers.table import get_explainer
 
-PUBLISHED = [
-    "conv1",
-    "maxpool",
-    "stage2.0.branch1",
-    "stage2.0.branch2.2",
-    "stage2",
-    "stage3.0.branch1",
-    "stage3.0.branch2.2",
-    "stage3",
-    "stage4.0.branch1",
-    "stage4.0.branch2.2",
-]
+PUBLISHED = ["conv1", "maxpool", *(f"stage{n}{part}" for n in (2, 3, 4) for part in (".0.branch1", ".0.branch2.2", ""))]
 
 
 def test_finds_the_ten_layers_of_the_public_code():
     # at 64 px the maps of TorchVision's ShuffleNetV2 shrink where they shrink at 224 px
     model = models.shufflenet_v2_x1_0(weights=None)
     layers = find_published_layers(model, torch.zeros(1, 3, 64, 64))
-    assert [layer.name for layer in layers] == PUBLISHED
+    assert [layer.name for layer in layers] == PUBLISHED[:-1]  # all but the last stage
     assert sum(layer.shape[0] for layer in layers) == 1208
 
 
