@@ -34,7 +34,7 @@ class Command:
     """Parameters with a further name, such as `("source", "--from")`."""
     suffixes: tuple[str, ...] = ()
     """Endings of the file `out`; without an ending it is a folder."""
-    out: str = ""
+    writes: str = ""
     """File or folder that must be named, such as `folder of the maps`; empty where the function does without."""
 
     @cached_property
@@ -86,9 +86,9 @@ def adapt(command: Command) -> tuple[Callable[..., object], list[str]]:
 
     def call(*positional: object, **values: object) -> None:
         values = dict(zip(names, positional, strict=False)) | values
-        if command.out and "out" not in values:
+        if command.writes and "out" not in values:
             example = "markers.parquet" if command.suffixes else "FOLDER"
-            raise InputError(f"name the {command.out} with -o {example}")
+            raise InputError(f"name the {command.writes} with -o {example}")
         others = {name: values.pop(name) for name in further.keys() & values.keys()}
         arguments: dict[str, Any] = {"on_progress": Terminal()} if "on_progress" in hints else {}
         groups: dict[str, dict[str, Any]] = {}

@@ -27,13 +27,13 @@ Run = Callable[..., None]
 
 
 def command(
-    name: str, function: str, example: str, *aliases: tuple[str, str], out: str = "", suffixes: tuple[str, ...] = ()
+    name: str, function: str, example: str, *aliases: tuple[str, str], writes: str = "", suffixes: tuple[str, ...] = ()
 ) -> Callable[[Run], Run]:
     """Register a function that calls a function of the library, given with its arguments, and prints the result."""
 
     def register(run: Run) -> Run:
         COMMANDS[name] = Command(
-            function=f"sliplens.{function}", run=run, example=example, aliases=aliases, out=out, suffixes=suffixes
+            function=f"sliplens.{function}", run=run, example=example, aliases=aliases, writes=writes, suffixes=suffixes
         )
         return run
 
@@ -184,7 +184,7 @@ def call_sensor_new(call: Any) -> None:
     "simulate",
     "simulation.trials:simulate",
     "sliplens simulate runs/mine/data --preset small",
-    out="folder of the data set",
+    writes="folder of the data set",
 )
 def call_simulate(call: Any) -> None:
     """Print the splits."""
@@ -323,7 +323,7 @@ def call_view(call: Any) -> None:
     "track",
     "markers.tracking:track",
     "sliplens track cup.mp4 --reference untouched.png -o markers.parquet",
-    out="table to write",
+    writes="table to write",
     suffixes=(".parquet",),
 )
 def call_track(call: Any) -> None:
@@ -343,7 +343,7 @@ def call_track(call: Any) -> None:
     "train",
     "training.fitting:train",
     "sliplens train runs/mine/data -o runs/mine/train --start-from chromatouch-pair --epochs 5",
-    out="folder of the network",
+    writes="folder of the network",
 )
 def call_train(call: Any) -> None:
     """Draw the learning curve."""
@@ -430,7 +430,7 @@ command(
     "study.explaining:explain",
     "sliplens explain runs/mine/train runs/mine/data -o runs/mine/explain",
     ("source", "--frames"),
-    out="folder of the maps",
+    writes="folder of the maps",
 )(lambda call: call())
 
 
@@ -445,12 +445,12 @@ command("score", "study.scoring:score", "sliplens score runs/mine/train runs/min
     "sliplens study runs/mine/data --network runs/mine/train -o runs/mine/study --on processes=2",
     ("networks", "--network"),
     ("methods", "--method"),
-    out="folder of the study",
+    writes="folder of the study",
 )
 def call_study(call: Any) -> None:
     """Draw the page."""
     call()
-    output.draw_report(call.keywords["out"])
+    output.draw_report(Path(call.keywords["out"]))
 
 
 @command(
@@ -458,7 +458,7 @@ def call_study(call: Any) -> None:
     "grip.episodes:run_episodes",
     "sliplens grip -o runs/grip --object egg --rendered",
     ("settings", "--set"),
-    out="folder to make",
+    writes="folder to make",
 )
 def call_grip(call: Any) -> None:
     """Print what became of the episodes, and draw the first."""
