@@ -11,6 +11,7 @@ from sliplens.recordings.capture import Forces
 from sliplens.recordings.labelling import AXES, ForceAxes, Vector
 from sliplens.recordings.options import LabelSettings
 
+GAP_STEPS = 4.0  # samples are missing where two are further apart than so many typical steps
 _WINDOW_S = 0.03  # time over which the force is averaged to find the touch: a press takes longer, a spike is shorter
 _FIRST_S, _GUARD_S = 0.1, 0.15  # untouched time at the start, and time before the touch that is left out of the tare
 # a touch departs by so many standard deviations, and by so much of the largest force: drift and vibration are none
@@ -28,6 +29,8 @@ _MOST_BEND = 0.25  # of the tilt: a pulled force turns by more than its angle, t
 _DRIFT_SIGMAS, _SLOPE_SIGMAS = 4.0, 3.0  # of a drift, to the end or before the touch: a false one costs good labels
 # of the uncertainty of a drift that is measured before the touch alone: all of it would cost 40 % of sound labels
 _UNCERTAIN_SHARE = 0.3
+# of a drift: an exponential warm-up as slow as ten trials bends by a twentieth of the way, as slow as one by a third
+_UNEVEN_SHARE = 0.1
 _UNCERTAIN_LOAD, _DRIFT_SHARE = 0.1, 0.01  # of the load: a drift that is noted, and one that does not matter
 _CALM_NOISES = 1.5
 _RELEASED_SHARE = 0.3  # of the load: a smaller force at the end may be the drift of an untouched sensor
@@ -171,7 +174,7 @@ def infer_axes(forces: Forces, settings: LabelSettings | None = None, *, moved_s
         notes.append(f"{most}: let go before the recording ends, wait before the touch, or give --drift-rate")
     if drift.any():
         most = f"the zero of the force sensor drifts by {_signed(drift * np.ptp(forces.time_s))} N (x, y, z) in all"
-        notes.append(f"{most}, which counts as an error of its size; let it warm up")
+        notes.append(f"{most}, evenly, which was taken off; let it warm up")
     return ForceAxes(
         normal=axis,
         sign=inferred_sign if sign is None else sign,
@@ -237,25 +240,29 @@ def _find_drift(
     """Measure the rate at which the zero drifts, to an untouched end or else before the touch, and its uncertainty."""
     time, force = forces.time_s, forces.force_n
     still, ends = time < until_s, time > time[-1] - _FIRST_S
-    away = np.linalg.norm(force - tare_n, axis=1)
+    slope, slope_sigma = np.zeros(3), np.zeros(3)
+    if still.sum() >= _FEW_STILL:
+        parts = np.array_split(np.flatnonzero(still), _STRETCHES)
+        middles = np.array([time[part].mean() for part in parts])
+        line, covariance = np.polyfit(
+            middles - middles.mean(), np.array([np.mean(force[part], axis=0) for part in parts]), 1, cov=True
+        )
+        white = noise / np.sqrt(still.sum()) / np.std(time[still])
+        slope, slope_sigma = line[0], np.maximum(np.sqrt(covariance[0, 0]), white)
+    real = np.abs(slope) > _SLOPE_SIGMAS * slope_sigma + 1e-9
+    load = float(np.quantile(np.linalg.norm(force - tare_n, axis=1), 0.9))
     offset = np.mean(force[ends], axis=0) - tare_n
     unsure = np.hypot(noise / np.sqrt(ends.sum()), tare_sigma_n)
+    span_s = time[ends].mean() - time[still].mean() if still.any() else np.inf
     # a sensor that wanders by more than its noise at the end is touched, or swings
     calm = np.all(np.std(force[ends], axis=0) < _CALM_NOISES * noise + 1e-9)
-    if calm and time[-1] < moved_s and np.linalg.norm(offset) < _RELEASED_SHARE * np.quantile(away, 0.9):
-        real = np.abs(offset) > np.maximum(_DRIFT_SIGMAS * unsure, _DRIFT_SHARE * np.quantile(away, 0.9))
-        span_s = time[-1] - time[still].mean() if still.any() else np.inf
+    # the end is untouched where little load is left, of the drift before the touch if that is measured
+    measured = _SLOPE_SIGMAS * np.linalg.norm(slope_sigma) * span_s < load
+    left = min(float(np.linalg.norm(offset - share * slope * span_s)) for share in (0.0, float(measured)))
+    if calm and time[-1] < moved_s and left < _RELEASED_SHARE * load:
+        real = np.abs(offset) > np.maximum(_DRIFT_SIGMAS * unsure, _DRIFT_SHARE * load)
         return np.where(real, offset / span_s, 0.0), unsure / span_s
-    if still.sum() < _FEW_STILL:
-        return np.zeros(3), np.zeros(3)
-    parts = np.array_split(np.flatnonzero(still), _STRETCHES)
-    middles = np.array([time[part].mean() for part in parts])
-    line, covariance = np.polyfit(
-        middles - middles.mean(), np.array([np.median(force[part], axis=0) for part in parts]), 1, cov=True
-    )
-    white = noise / np.sqrt(still.sum()) / np.std(time[still])
-    unsure = np.maximum(np.sqrt(covariance[0, 0]), white)
-    return np.where(np.abs(line[0]) > _SLOPE_SIGMAS * unsure + 1e-9, line[0], 0.0), _UNCERTAIN_SHARE * unsure
+    return np.where(real, slope, 0.0), np.where(real, 1.0, _UNCERTAIN_SHARE) * slope_sigma
 
 
 def _signed(values: Axes) -> str:
@@ -321,10 +328,9 @@ class ContactForces:
         """Return the standard uncertainty of the tare, in which drifts count as errors, as `noise_n`."""
         normal, tangential = self._split(self.axes.tare_sigma_n)
         tilt = self.axes.direction_sigma * np.abs(np.interp(time_s, self.time_s, self.normal_n))
-        normal_drift, drift = self._split(np.hypot(self.axes.drift_n_s, self.axes.drift_sigma_n_s))
-        begin = float(self.time_s[0])
-        until = begin if self.axes.still_until_s is None else self.axes.still_until_s
-        since = np.maximum(time_s - (begin + until) / 2, 0)
+        uneven = _UNEVEN_SHARE * np.array(self.axes.drift_n_s)
+        normal_drift, drift = self._split(np.hypot(uneven, self.axes.drift_sigma_n_s))
+        since = np.maximum(_time_since_tare(self.recorded, self.axes, time_s), 0)
         # of a drift the length counts, for it is the same in all samples
         across = np.hypot(np.hypot(tangential, np.sqrt(2) * drift * since), tilt)
         return np.hypot(normal, normal_drift * since), across
@@ -354,9 +360,16 @@ def turn_matrix(axes: ForceAxes) -> Float[np.ndarray, "3 3"]:
     return np.eye(3) + cross + cross @ cross / (1 + np.dot(axes.direction, onto))
 
 
+def _time_since_tare(forces: Forces, axes: ForceAxes, time_s: Times) -> Times:
+    """Return the time since the middle of the untouched samples."""
+    begin = float(forces.time_s[0])
+    return time_s - (begin + (begin if axes.still_until_s is None else axes.still_until_s)) / 2
+
+
 def apply_axes(forces: Forces, axes: ForceAxes) -> ContactForces:
-    """Subtract the tare and turn the forces into the axes of the contact."""
-    force = (forces.force_n - axes.tare_n) @ turn_matrix(axes).T
+    """Subtract the tare and its drift, and turn the forces into the axes of the contact."""
+    drift_n = np.outer(_time_since_tare(forces, axes, forces.time_s), axes.drift_n_s)
+    force = (forces.force_n - axes.tare_n - drift_n) @ turn_matrix(axes).T
     return ContactForces(
         recorded=forces,
         normal_n=axes.sign * force[:, axes.normal_index],

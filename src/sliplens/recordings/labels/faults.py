@@ -23,7 +23,6 @@ Codes: TypeAlias = Int[np.ndarray, " samples"]
 ImageMotionTest: TypeAlias = Callable[[float, float], bool]
 """Returns True where the image moves as it would at a jump of the force, given its time (s) and size (N)."""
 
-GAP_STEPS = 4.0  # samples are missing where two are further apart than so many typical steps
 FAULTS = (Reason.NONE, Reason.DROP_OUT, Reason.STUCK, Reason.CLIPPED, Reason.SPIKE, Reason.STEP, Reason.MARKED)
 _DROP_OUT, _STUCK, _CLIPPED, _SPIKE, _STEP, MARKED = range(1, len(FAULTS))
 
@@ -71,7 +70,7 @@ class Screened:
             )
             for start, end in pairwise(ends.tolist()) if codes[start]
         ]  # fmt: skip
-        gaps = np.flatnonzero(np.diff(time) > GAP_STEPS * axes.typical_step(time))
+        gaps = np.flatnonzero(np.diff(time) > axes.GAP_STEPS * axes.typical_step(time))
         faults += [
             ForceFault(kind=Reason.MISSING_SAMPLES, start_s=float(time[at]), end_s=float(time[at + 1]))
             for at in gaps.tolist()

@@ -16,6 +16,7 @@ _REACH_S, _TRIES = 0.08, 41  # how far the break may lie from the rough guess, a
 # lengths of the fall that are tried, from a sudden drop to that of a soft fingertip
 _FALLS_S = (0.005, 0.007, 0.01, 0.014, 0.02, 0.028, 0.04, 0.056, 0.08)
 _LEAST_BEFORE, _LEAST_AFTER, _LEAST_LINE = 6, 3, 4  # samples that the sides of a break, and a line up to it, need
+_GAP_S = 0.04  # a gap of the samples that may hide a slip: over a shorter one the fit changes little
 _PARAMETERS = 7  # degrees of freedom of a fit: five coefficients, the time of the break, the end of the fall
 _MEMORY, _LONGEST_BLOCK = 0.2, 0.1  # residuals that correlate by more are resampled together; share of the samples
 
@@ -42,7 +43,11 @@ def fit_break(
         if np.sum(time_s < moment) >= _LEAST_BEFORE and np.sum(time_s > moment + fall) >= _LEAST_AFTER
     ]
     if not tried:
-        return _bracket_break(time_s, values, about_s=about_s, rng=rng, draws=draws)
+        # the break itself is rough: a sample half a step beyond may still be before it
+        near = np.flatnonzero(time_s <= about_s + axes.typical_step(time_s) / 2)
+        before = near[max(0, len(near) - _LEAST_BEFORE) : np.argmax(values[near]) + 1] if len(near) else near
+        between_s = tuple(time_s[before[-1] :][:2]) if len(before) else ()
+        return bracket_break(time_s[before], values[before], between_s=between_s, rng=rng, draws=draws)
     moments, falls = np.array(tried).T
     since = time_s - moments[:, None]
     before, after = np.minimum(since, 0), np.maximum(since, 0)
@@ -58,22 +63,17 @@ def fit_break(
     return Break(float(moments[index]), float(level), _best(bases, triangles, drawn)[1])
 
 
-def _bracket_break(time_s: Samples, values: Samples, *, about_s: float, rng: np.random.Generator, draws: int) -> Break:
-    """Extend the line through the last samples before a break to anywhere before the next sample."""
-    # the break itself is rough: a sample half a step beyond may still be before it
-    near = np.flatnonzero(time_s <= about_s + axes.typical_step(time_s) / 2)
-    before = near[max(0, len(near) - _LEAST_BEFORE) : np.argmax(values[near]) + 1] if len(near) else near
-    if len(before) < _LEAST_LINE or before[-1] + 1 == len(time_s):
-        few = (
-            f"only {np.sum(time_s < about_s)} samples before the slip at {about_s:.2f} s and {np.sum(time_s > about_s)}"
-        )
-        raise RecordingError(f"{few} after it can be used; record the forces faster or give the friction with --mu")
-    last_s, next_s = time_s[before[-1] : before[-1] + 2]
-    line = np.polynomial.Polynomial.fit(time_s[before], values[before], 1)
-    noise = np.std(values[before] - line(time_s[before]), ddof=2)
-    times = rng.uniform(last_s, next_s, draws)
-    middle = float(last_s + next_s) / 2
-    return Break(middle, float(line(middle)), line(times) + rng.normal(0, noise, draws))
+def bracket_break(
+    time_s: Samples, values: Samples, *, between_s: Sequence[float], rng: np.random.Generator, draws: int
+) -> Break:
+    """Extend the line through samples to a break anywhere between two times."""
+    if len(time_s) < _LEAST_LINE or len(between_s) < 2:
+        few = f"only {len(time_s)} samples up to the slip, or none after it, can be used"
+        raise RecordingError(f"{few}; record the forces faster or give the friction with --mu")
+    line = np.polynomial.Polynomial.fit(time_s, values, 1)
+    noise = np.std(values - line(time_s), ddof=2) * np.sqrt(_LEAST_LINE / len(time_s))
+    times, middle_s = rng.uniform(*between_s, draws), float(np.mean(between_s))
+    return Break(middle_s, float(line(middle_s)), line(times) + rng.normal(0, noise, draws))
 
 
 def _best(
@@ -133,6 +133,11 @@ class ImageMotion:
 
     time_s: Float[np.ndarray, " frames"]
     motion: Float[np.ndarray, " frames"]  #: See `measure_motion`; the first value is not used.
+
+
+def _longest_step(step_s: float) -> float:
+    """Return the time between two samples beyond which they have a gap that may hide a slip."""
+    return max(axes.GAP_STEPS * step_s, _GAP_S)
 
 
 class _Slip(NamedTuple):
@@ -300,26 +305,35 @@ def _fit_slip(
     draws: int,
 ) -> _Slip:
     """Fit the break of the ratio about the rough time of a slip."""
-    step = axes.typical_step(forces.time_s)
+    time, step = forces.time_s, axes.typical_step(forces.time_s)
+    wide = (np.diff(time) > _longest_step(step)) & (time[:-1] < rough_s + _STEP_S) & (time[1:] > rough_s - _STEP_S)
+    hidden = bool(wide.any()) and reach_s > 0  # in a gap of the samples
+    between_s = float(time[np.argmax(wide)]), float(time[np.argmax(wide) + 1])
+    until_s = between_s[0] if hidden else rough_s
 
     def fit_near(before_s: float) -> tuple[Break, float]:
-        near = forces.time_s >= rough_s - max(before_s, _BEFORE_STEPS * step)
-        near &= forces.time_s <= rough_s + max(_AFTER_S, _AFTER_STEPS * step)
+        near = time >= until_s - max(before_s, _BEFORE_STEPS * step)
+        near &= time <= until_s + (0 if hidden else max(_AFTER_S, _AFTER_STEPS * step))
         near &= forces.normal_n > contact_threshold_n
-        before = near & (forces.time_s <= rough_s)
+        before = near & (time <= until_s)
         if not before.any():
             raise RecordingError(f"nothing presses before the slip at {rough_s:.2f} s; set it later")
         pull = forces.tangential_n[before].mean(axis=0)
         # along the direction of the pull: a projection is not biased by noise
         ratio = forces.tangential_n[near] @ (pull / np.linalg.norm(pull)) / forces.normal_n[near]
-        fit = fit_break(forces.time_s[near], ratio, about_s=rough_s, rng=rng, draws=draws, reach_s=reach_s)
+        fit = (
+            bracket_break(time[near], ratio, between_s=between_s, rng=rng, draws=draws)
+            if hidden
+            else fit_break(time[near], ratio, about_s=rough_s, rng=rng, draws=draws, reach_s=reach_s)
+        )
         return fit, float(forces.normal_n[near].mean())
 
     fit, normal_n = fit_near(_BEFORE_S[0])
     for before_s in _BEFORE_S[1:]:
         top = np.abs(means.time_s - fit.time_s) <= _STEP_S
         apart = abs(fit.level - means.ratio[top].max(initial=0.0))
-        if reach_s == 0 or apart <= _LIKE_SHARE * fit.level + _LIKE_SIGMAS * means.sigma[top].max(initial=0.0):
+        like = _LIKE_SHARE * fit.level + _LIKE_SIGMAS * means.sigma[top].max(initial=0.0)
+        if hidden or reach_s == 0 or apart <= like:
             break
         fit, normal_n = fit_near(before_s)
     # no resampling of the slip can show the uncertainty of the tare
@@ -350,8 +364,11 @@ def _mean_ratio(forces: ContactForces, *, window_s: float, contact_threshold_n: 
 
 def _find_falls(means: _MeanRatio, *, start_s: float, end_s: float, friction_change: float) -> list[float]:
     """Rough times at which the ratio of a contact suddenly falls from a height that it exceeds nowhere."""
-    time, step = means.time_s, max(axes.typical_step(means.time_s), 1e-9)
-    span = (time >= start_s) & (time <= end_s)
+    step = max(axes.typical_step(means.time_s), 1e-9)
+    span = (means.time_s >= start_s) & (means.time_s <= end_s)
+    # on a clock that stands still in a gap: there the ratio may have fallen as suddenly as elsewhere
+    steps = np.diff(means.time_s, prepend=means.time_s[0])
+    time = np.cumsum(np.where(steps > _longest_step(step), step, steps))
     inside, pressed = span & means.pulled, span & means.pressed
     if not inside.any():
         return []
@@ -393,7 +410,7 @@ def _find_falls(means: _MeanRatio, *, start_s: float, end_s: float, friction_cha
             1 - pull[1] / pull[0] > _PULL_SHARE * (1 - after / before),
         )
         if all(slips):
-            falls.append(float(time[top]))
+            falls.append(float(means.time_s[top]))
     return sorted(falls)
 
 

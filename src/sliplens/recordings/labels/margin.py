@@ -14,7 +14,7 @@ from sliplens.recordings.capture import Forces
 from sliplens.recordings.labelling import BY_HAND, FrictionEstimate, LabelBasis, Lag, Reason, describe_faults
 from sliplens.recordings.labels import axes
 from sliplens.recordings.labels.axes import ContactForces, Samples
-from sliplens.recordings.labels.faults import FAULTS, GAP_STEPS, MARKED, Screened, screen_trial
+from sliplens.recordings.labels.faults import FAULTS, MARKED, Screened, screen_trial
 from sliplens.recordings.labels.friction import ImageMotion, estimate_friction, find_contacts
 from sliplens.recordings.labels.lag import doubt_agreement
 from sliplens.recordings.options import LabelSettings
@@ -118,7 +118,7 @@ def label_frames(
     if apply_lag and (lag is None or lag.doubt):
         cause = "it is not estimated" if lag is None else lag.doubt
         raise RecordingError(f"the lag cannot be applied: {cause}; give the lag by hand or leave it out")
-    window, gap = axes.typical_step(frame_time_s), GAP_STEPS * axes.typical_step(forces.time_s)
+    window, gap = axes.typical_step(frame_time_s), axes.GAP_STEPS * axes.typical_step(forces.time_s)
     threshold = contact_threshold(forces, window_s=window)
     onset = np.inf if friction.onset_s is None else friction.onset_s
     forces_at = partial(interpolate_forces, forces, window_s=window, gap_s=gap, until_s=onset)
@@ -134,10 +134,10 @@ def label_frames(
     end = np.where(time < onset, np.minimum(time + reach, onset - window / 2), time + reach)
     early, late = (_used(forces_at(moment), friction, threshold) for moment in (end - 2 * reach, end))
     swing = (late - early) / 2 * unsure / reach
-    drift = np.zeros(len(time))
-    if contact.any():  # distance in time from the slip, as a share of the time from touch to slip, at most 1
-        touch, last = time[np.argmax(contact)], min(onset, time[-1])
-        drift = settings.friction_change * np.clip(np.abs(last - time) / max(last - touch, 1e-9), 0, 1)
+    # distance in time from the slip, where friction is known, as a share of the time from touch to slip, at most 1
+    drift = np.full(len(time), settings.friction_change)
+    if contact.any() and friction.onset_s is not None:
+        drift *= np.clip(np.abs(onset - time) / max(onset - time[np.argmax(contact)], 1e-9), 0, 1)
     normal = np.maximum(at.normal_n, threshold)
     variance = (
         (at.tangential_sigma_n / (friction.mu * normal)) ** 2
