@@ -366,10 +366,14 @@ def _time_since_tare(forces: Forces, axes: ForceAxes, time_s: Times) -> Times:
     return time_s - (begin + (begin if axes.still_until_s is None else axes.still_until_s)) / 2
 
 
+def subtract_zero(forces: Forces, axes: ForceAxes) -> Float[np.ndarray, "samples 3"]:
+    """Subtract the tare and its even drift."""
+    return forces.force_n - axes.tare_n - np.outer(_time_since_tare(forces, axes, forces.time_s), axes.drift_n_s)
+
+
 def apply_axes(forces: Forces, axes: ForceAxes) -> ContactForces:
     """Subtract the tare and its drift, and turn the forces into the axes of the contact."""
-    drift_n = np.outer(_time_since_tare(forces, axes, forces.time_s), axes.drift_n_s)
-    force = (forces.force_n - axes.tare_n - drift_n) @ turn_matrix(axes).T
+    force = subtract_zero(forces, axes) @ turn_matrix(axes).T
     return ContactForces(
         recorded=forces,
         normal_n=axes.sign * force[:, axes.normal_index],

@@ -358,10 +358,11 @@ def _classify_jumps(forces: Forces, *, image_moves: ImageMotionTest) -> tuple[li
     if not resting:
         return [], []
     try:
-        sensor = axes.infer_axes(forces)
+        # a step at the end must not be taken for a drift
+        sensor = axes.infer_axes(forces, moved_s=-np.inf)
     except RecordingError:
         return resting, []  # nothing is ever loaded
-    time, force = forces.time_s, forces.force_n - sensor.tare_n
+    time, force = forces.time_s, axes.subtract_zero(forces, sensor)
     at = np.array([at for at, _ in jumps])
     groups = [group.tolist() for group in np.split(at, np.flatnonzero(np.diff(time[at]) > _RELEASE_S) + 1)]
     starts, ends = [0, *(group[-1] for group in groups)], [*(group[0] for group in groups), len(time)]
