@@ -334,10 +334,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--dry", type=int, default=4, help="dry trials, over four days, held and let go")
     parser.add_argument("--wet", type=int, default=1, help="wet trials, held and let go")
+    parser.add_argument("--seed", type=int, default=0, help="first seed")
     parser.add_argument("--seeds", type=int, default=1, help="number of seeds to pool")
     parser.add_argument("--json", action="store_true", help="print one JSON object as the last line")
     arguments = parser.parse_args()
-    seeds = range(arguments.seeds)
+    seeds = range(arguments.seed, arguments.seed + arguments.seeds)
     outcomes = [outcome for seed in seeds for outcome in measure_seed(seed, dry=arguments.dry, wet=arguments.wet)]
     numbers = {**summarise(outcomes), "by_fault": summarise_faults(outcomes)}
     print(json.dumps(numbers, indent=None if arguments.json else 2))

@@ -3,13 +3,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from sliplens.errors import ContactError
-from sliplens.mechanics import (
-    hertz_displacement,
-    partial_slip_displacement,
-    shear_displacement,
-    stick_radius,
-)
+from sliplens.mechanics import hertz_displacement, partial_slip_displacement, shear_displacement, stick_radius
 
 FEW = settings(max_examples=25, deadline=None)
 A, R = 0.008, 0.020
@@ -57,17 +51,9 @@ LOADS = pytest.mark.parametrize(("field", "point_force"), [(pressed, boussinesq)
 FIELDS = pytest.mark.parametrize("field", [pressed, sheared])
 
 
-def slip(x, y, z, margin, nu=0.5):
-    return partial_slip_displacement(
-        x,
-        y,
-        z,
-        contact_radius_m=A,
-        sphere_radius_m=R,
-        friction_coefficient=0.6,
-        safety_margin=margin,
-        poisson_ratio=nu,
-    )
+def slip(x, y, z, margin, nu):
+    contact = {"contact_radius_m": A, "sphere_radius_m": R, "friction_coefficient": 0.6, "poisson_ratio": nu}
+    return partial_slip_displacement(x, y, z, **contact, safety_margin=margin)
 
 
 # on the axis, under the contact, just under its edge, beside it, far beside it
@@ -93,15 +79,9 @@ def test_field_obeys_naviers_equation(field, nu, rng):
     h = 1e-3
     step = h * np.eye(3)
     points = rng.uniform([-2, -2, 0.5], [2, 2, 2], (50, 3))
-    second = np.array(
-        [
-            [
-                sum(a * b * field(points + a * i + b * j, nu) for a in (1, -1) for b in (1, -1)) / (4 * h**2)
-                for j in step
-            ]
-            for i in step
-        ]
-    )
+    corners = [(a, b) for a in (1, -1) for b in (1, -1)]
+    mixed = [[sum(a * b * field(points + a * i + b * j, nu) for a, b in corners) for j in step] for i in step]
+    second = np.array(mixed) / (4 * h**2)
     laplacian = np.einsum("iink->nk", second)
     divergence_slope = np.einsum("kjnj->nk", second)
     np.testing.assert_allclose((1 - 2 * nu) * laplacian + divergence_slope, 0, atol=4e-4)
@@ -225,27 +205,3 @@ def test_frames_run_down_and_markers_across():
         assert field.shape == (3, 4)
         np.testing.assert_array_equal(field[0], 0)  # the first frame has no contact
         assert np.all(field[1:] != 0)
-
-
-HERTZ = {"distance_m": 0.001, "depth_m": 0.001, "contact_radius_m": A, "sphere_radius_m": R, "poisson_ratio": 0.5}
-SLIP = {
-    "x_m": 0.001, "y_m": 0.001, "depth_m": 0.001, "contact_radius_m": A, "sphere_radius_m": R,
-    "friction_coefficient": 0.6, "safety_margin": 0.5, "poisson_ratio": 0.5,
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("function", "good", "name", "bad", "message"),
-    [
-        (hertz_displacement, HERTZ, "distance_m", -0.1, "distance from the contact's axis must not be negative"),
-        (hertz_displacement, HERTZ, "depth_m", -0.1, "depth must not be negative, got -0.1 m; flip its sign"),
-        (hertz_displacement, HERTZ, "sphere_radius_m", 0.0, "sphere radius must be positive and finite"),
-        (hertz_displacement, HERTZ, "poisson_ratio", 0.6, r"must lie in \[0, 0.5\], got 0.6; rubber is near 0.5"),
-        (partial_slip_displacement, SLIP, "contact_radius_m", -0.1, "contact radius must not be negative"),
-        (partial_slip_displacement, SLIP, "friction_coefficient", -0.6, "friction must not be negative, got -0.6"),
-        (partial_slip_displacement, SLIP, "safety_margin", 1.5, r"safety margins must lie in \[0, 1\]"),
-    ],
-)
-def test_impossible_loads_and_gels_are_refused(function, good, name, bad, message):
-    with pytest.raises(ContactError, match=message):
-        function(**(good | {name: bad}))

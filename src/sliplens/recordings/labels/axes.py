@@ -11,7 +11,7 @@ from sliplens.recordings.capture import Forces
 from sliplens.recordings.labelling import AXES, ForceAxes, Vector
 from sliplens.recordings.options import LabelSettings
 
-GAP_STEPS = 4.0  # samples are missing where two are further apart than so many typical steps
+_GAP_STEPS = 4.0  # samples are missing where two are further apart than so many typical steps
 _WINDOW_S = 0.03  # time over which the force is averaged to find the touch: a press takes longer, a spike is shorter
 _FIRST_S, _GUARD_S = 0.1, 0.15  # untouched time at the start, and time before the touch that is left out of the tare
 # a touch departs by so many standard deviations, and by so much of the largest force: drift and vibration are none
@@ -34,6 +34,7 @@ _UNEVEN_SHARE = 0.1
 _UNCERTAIN_LOAD, _DRIFT_SHARE = 0.1, 0.01  # of the load: a drift that is noted, and one that does not matter
 _CALM_NOISES = 1.5
 _RELEASED_SHARE = 0.3  # of the load: a smaller force at the end may be the drift of an untouched sensor
+_MEASURED_SHARE = 0.5  # of the load: a drift before the touch that is less certain does not show a release
 _MAD_TO_SIGMA = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
 _MOST_WINDOWS = 4_000_000
 
@@ -46,6 +47,11 @@ Times: TypeAlias = Float[np.ndarray, " times"]
 def typical_step(time_s: Samples) -> float:
     """Median time between samples, in seconds; 0 for one sample."""
     return float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+
+
+def longest_step(time_s: Samples) -> float:
+    """Return the time between two samples beyond which samples are missing."""
+    return _GAP_STEPS * typical_step(time_s)
 
 
 def mean_force(
@@ -245,7 +251,7 @@ def _find_drift(
         parts = np.array_split(np.flatnonzero(still), _STRETCHES)
         middles = np.array([time[part].mean() for part in parts])
         line, covariance = np.polyfit(
-            middles - middles.mean(), np.array([np.mean(force[part], axis=0) for part in parts]), 1, cov=True
+            middles - middles.mean(), np.array([np.median(force[part], axis=0) for part in parts]), 1, cov=True
         )
         white = noise / np.sqrt(still.sum()) / np.std(time[still])
         slope, slope_sigma = line[0], np.maximum(np.sqrt(covariance[0, 0]), white)
@@ -257,7 +263,7 @@ def _find_drift(
     # a sensor that wanders by more than its noise at the end is touched, or swings
     calm = np.all(np.std(force[ends], axis=0) < _CALM_NOISES * noise + 1e-9)
     # the end is untouched where little load is left, of the drift before the touch if that is measured
-    measured = _SLOPE_SIGMAS * np.linalg.norm(slope_sigma) * span_s < load
+    measured = np.linalg.norm(slope_sigma) * span_s < _MEASURED_SHARE * load
     left = min(float(np.linalg.norm(offset - share * slope * span_s)) for share in (0.0, float(measured)))
     if calm and time[-1] < moved_s and left < _RELEASED_SHARE * load:
         real = np.abs(offset) > np.maximum(_DRIFT_SIGMAS * unsure, _DRIFT_SHARE * load)
@@ -305,6 +311,17 @@ def _find_touch(forces: Forces, *, tare_n: Vector | None) -> float:
     return float(time[np.argmax(touched)]) if touched.any() else float("inf")
 
 
+class MeanForces(NamedTuple):
+    """Forces averaged about given times, and their standard uncertainties."""
+
+    normal_n: Times
+    tangential_n: Times  # length
+    normal_noise_n: Times
+    tangential_noise_n: Times
+    normal_tare_n: Times
+    tangential_tare_n: Times
+
+
 @dataclass(frozen=True, kw_only=True)
 class ContactForces:
     """Forces in the axes of the contact, tare taken off, on the force sensor's clock."""
@@ -334,6 +351,23 @@ class ContactForces:
         # of a drift the length counts, for it is the same in all samples
         across = np.hypot(np.hypot(tangential, np.sqrt(2) * drift * since), tilt)
         return np.hypot(normal, normal_drift * since), across
+
+    def means(self, time_s: Times, *, window_s: float, until_s: float = np.inf) -> "MeanForces":
+        """Average the forces over windows about given times, none over the onset of slip `until_s`."""
+        samples = self.time_s
+        normal, tangential = (
+            mean_force(samples, values, time_s, window_s=window_s, until_s=until_s)
+            for values in (self.normal_n, self.tangential_n)
+        )
+        # a shorter window averages less noise away, at worst none
+        at_s = np.clip(time_s, samples[0], samples[-1])
+        length = 2 * half_window(samples, at_s, window_s=window_s, until_s=until_s)
+        more = np.sqrt(window_s / np.maximum(length, 1e-9))
+        normal_noise, noise = (
+            np.minimum(mean * more, max(sample, mean))
+            for mean, sample in zip(self.noise_of_means_n(window_s), self.noise_n, strict=True)
+        )
+        return MeanForces(normal, magnitude(tangential, sigma_n=noise), normal_noise, noise, *self.tare_sigma_n(time_s))
 
     def noise_of_means_n(self, window_s: float) -> tuple[float, float]:
         """Return `noise_n` of means over a window, measured on means, white or not."""

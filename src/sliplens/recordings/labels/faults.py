@@ -70,7 +70,7 @@ class Screened:
             )
             for start, end in pairwise(ends.tolist()) if codes[start]
         ]  # fmt: skip
-        gaps = np.flatnonzero(np.diff(time) > axes.GAP_STEPS * axes.typical_step(time))
+        gaps = np.flatnonzero(np.diff(time) > axes.longest_step(time))
         faults += [
             ForceFault(kind=Reason.MISSING_SAMPLES, start_s=float(time[at]), end_s=float(time[at + 1]))
             for at in gaps.tolist()

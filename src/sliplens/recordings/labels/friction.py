@@ -72,7 +72,7 @@ def bracket_break(
         raise RecordingError(f"{few}; record the forces faster or give the friction with --mu")
     line = np.polynomial.Polynomial.fit(time_s, values, 1)
     noise = np.std(values - line(time_s), ddof=2) * np.sqrt(_LEAST_LINE / len(time_s))
-    times, middle_s = rng.uniform(*between_s, draws), float(np.mean(between_s))
+    times, middle_s = rng.uniform(between_s[0], between_s[1], draws), float(np.mean(between_s))
     return Break(middle_s, float(line(middle_s)), line(times) + rng.normal(0, noise, draws))
 
 
@@ -133,11 +133,6 @@ class ImageMotion:
 
     time_s: Float[np.ndarray, " frames"]
     motion: Float[np.ndarray, " frames"]  #: See `measure_motion`; the first value is not used.
-
-
-def _longest_step(step_s: float) -> float:
-    """Return the time between two samples beyond which they have a gap that may hide a slip."""
-    return max(axes.GAP_STEPS * step_s, _GAP_S)
 
 
 class _Slip(NamedTuple):
@@ -306,7 +301,11 @@ def _fit_slip(
 ) -> _Slip:
     """Fit the break of the ratio about the rough time of a slip."""
     time, step = forces.time_s, axes.typical_step(forces.time_s)
-    wide = (np.diff(time) > _longest_step(step)) & (time[:-1] < rough_s + _STEP_S) & (time[1:] > rough_s - _STEP_S)
+    wide = (
+        (np.diff(time) > max(axes.longest_step(time), _GAP_S))
+        & (time[:-1] < rough_s + _STEP_S)
+        & (time[1:] > rough_s - _STEP_S)
+    )
     hidden = bool(wide.any()) and reach_s > 0  # in a gap of the samples
     between_s = float(time[np.argmax(wide)]), float(time[np.argmax(wide) + 1])
     until_s = between_s[0] if hidden else rough_s
@@ -345,21 +344,20 @@ def _fit_slip(
 
 def _mean_ratio(forces: ContactForces, *, window_s: float, contact_threshold_n: float) -> _MeanRatio:
     time = forces.time_s
-    normal = axes.mean_force(time, forces.normal_n, time, window_s=window_s)
-    normal_noise, noise = forces.noise_of_means_n(window_s)
-    tangential = axes.magnitude(axes.mean_force(time, forces.tangential_n, time, window_s=window_s), sigma_n=noise)
-    pressed = normal > max(contact_threshold_n, PRESSED_SHARE * normal.max())
+    means = forces.means(time, window_s=window_s)
+    pressed = means.normal_n > max(contact_threshold_n, PRESSED_SHARE * means.normal_n.max())
     # the window shrinks at the ends, where a single sample's noise is no fall
     pressed &= (time - time[0] >= window_s / 2) & (time[-1] - time >= window_s / 2)
     # without a contact nothing slips: a knock, where the contact was set by hand
     pressed &= time >= (-np.inf if forces.axes.still_until_s is None else forces.axes.still_until_s)
-    safe = np.where(pressed, normal, 1)
-    ratio = np.where(pressed, tangential / safe, 0)
-    sigma = np.where(pressed, np.hypot(noise, ratio * normal_noise) / safe, 0)
-    normal_tare, tangential_tare = forces.tare_sigma_n(time)
-    tare = np.where(pressed, np.hypot(tangential_tare, ratio * normal_tare) / safe, 0)
-    least, pulled = ratio - _DROP_SIGMAS * sigma, pressed & (tangential > 3 * noise)
-    return _MeanRatio(time, normal, tangential, ratio, sigma, least, tare, pressed, pulled)
+    safe = np.where(pressed, means.normal_n, 1)
+    ratio = np.where(pressed, means.tangential_n / safe, 0)
+    sigma, tare = (
+        np.where(pressed, np.hypot(across, ratio * along) / safe, 0)
+        for along, across in zip(means[2::2], means[3::2], strict=True)
+    )
+    least, pulled = ratio - _DROP_SIGMAS * sigma, pressed & (means.tangential_n > 3 * means.tangential_noise_n)
+    return _MeanRatio(time, means.normal_n, means.tangential_n, ratio, sigma, least, tare, pressed, pulled)
 
 
 def _find_falls(means: _MeanRatio, *, start_s: float, end_s: float, friction_change: float) -> list[float]:
@@ -368,7 +366,7 @@ def _find_falls(means: _MeanRatio, *, start_s: float, end_s: float, friction_cha
     span = (means.time_s >= start_s) & (means.time_s <= end_s)
     # on a clock that stands still in a gap: there the ratio may have fallen as suddenly as elsewhere
     steps = np.diff(means.time_s, prepend=means.time_s[0])
-    time = np.cumsum(np.where(steps > _longest_step(step), step, steps))
+    time = np.cumsum(np.where(steps > max(axes.longest_step(means.time_s), _GAP_S), step, steps))
     inside, pressed = span & means.pulled, span & means.pressed
     if not inside.any():
         return []

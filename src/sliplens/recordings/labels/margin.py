@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple, TypeAlias, TypeVar
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -13,7 +13,7 @@ from sliplens.mechanics import safety_margin, stick_ratio
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.labelling import BY_HAND, FrictionEstimate, LabelBasis, Lag, Reason, describe_faults
 from sliplens.recordings.labels import axes
-from sliplens.recordings.labels.axes import ContactForces, Samples
+from sliplens.recordings.labels.axes import ContactForces, MeanForces, Samples
 from sliplens.recordings.labels.faults import FAULTS, MARKED, Screened, screen_trial
 from sliplens.recordings.labels.friction import ImageMotion, estimate_friction, find_contacts
 from sliplens.recordings.labels.lag import doubt_agreement
@@ -21,45 +21,6 @@ from sliplens.recordings.options import LabelSettings
 from sliplens.recordings.trial import ContactState, Labels
 
 Frames: TypeAlias = Float[np.ndarray, " frames"]
-
-
-class FrameForces(NamedTuple):
-    """Forces at the times of frames, and their standard uncertainties from noise and tare."""
-
-    normal_n: Frames
-    tangential_n: Frames  # length
-    normal_sigma_n: Frames
-    tangential_sigma_n: Frames
-    missing: Bool[np.ndarray, " frames"]  # the neighbouring samples are too far apart, or missing on one side
-
-
-def interpolate_forces(
-    forces: ContactForces, time_s: Frames, *, window_s: float, gap_s: float, until_s: float
-) -> FrameForces:
-    """Interpolate the forces onto given times: the mean, over a window about each, of the line through the samples."""
-    samples = forces.time_s
-    normal, tangential = (
-        axes.mean_force(samples, values, time_s, window_s=window_s, until_s=until_s)
-        for values in (forces.normal_n, forces.tangential_n)
-    )
-    noise, sample_noise = forces.noise_of_means_n(window_s), forces.noise_n
-    # a shorter window averages less noise away, at worst none
-    length = 2 * axes.half_window(samples, np.clip(time_s, samples[0], samples[-1]), window_s=window_s, until_s=until_s)
-    more = np.sqrt(window_s / np.maximum(length, 1e-9))
-    normal_noise, tangential_noise = (
-        np.minimum(mean * more, max(sample, mean)) for mean, sample in zip(noise, sample_noise, strict=True)
-    )
-    normal_tare, tangential_tare = forces.tare_sigma_n(time_s)
-    # the neighbours of a time on a sample are both that sample
-    before = samples[np.maximum(np.searchsorted(samples, time_s, side="right") - 1, 0)]
-    after = samples[np.minimum(np.searchsorted(samples, time_s), len(samples) - 1)]
-    return FrameForces(
-        normal_n=normal,
-        tangential_n=axes.magnitude(tangential, sigma_n=tangential_noise),
-        normal_sigma_n=np.hypot(normal_noise, normal_tare),
-        tangential_sigma_n=np.hypot(tangential_noise, tangential_tare),
-        missing=(time_s < samples[0]) | (time_s > samples[-1]) | (after - before > gap_s),
-    )
 
 
 # least normal force of a contact, by its noise and its largest: of a lighter touch the margin would be all noise
@@ -118,14 +79,19 @@ def label_frames(
     if apply_lag and (lag is None or lag.doubt):
         cause = "it is not estimated" if lag is None else lag.doubt
         raise RecordingError(f"the lag cannot be applied: {cause}; give the lag by hand or leave it out")
-    window, gap = axes.typical_step(frame_time_s), axes.GAP_STEPS * axes.typical_step(forces.time_s)
+    window = axes.typical_step(frame_time_s)
     threshold = contact_threshold(forces, window_s=window)
     onset = np.inf if friction.onset_s is None else friction.onset_s
-    forces_at = partial(interpolate_forces, forces, window_s=window, gap_s=gap, until_s=onset)
+    forces_at = partial(forces.means, window_s=window, until_s=onset)
     shift = lag.lag_s if lag is not None and apply_lag else 0.0
     unsure = 0.0 if lag is None else lag.sigma_s if apply_lag else float(np.hypot(lag.lag_s, lag.sigma_s))
     time = frame_time_s - shift
     at = forces_at(time)
+    # the neighbours of a time on a sample are both that sample
+    samples, count = forces.time_s, len(forces.time_s)
+    before = samples[np.maximum(np.searchsorted(samples, time, side="right") - 1, 0)]
+    after = samples[np.minimum(np.searchsorted(samples, time), count - 1)]
+    missing = (time < samples[0]) | (time > samples[-1]) | (after - before > axes.longest_step(samples))
     contact = (at.normal_n >= threshold) & (time >= (-np.inf if settings.contact_s is None else settings.contact_s))
     used = _used(at, friction, threshold)
     # a chord as short as the lag's uncertainty would count the noise of its ends, which `variance` counts already
@@ -140,8 +106,8 @@ def label_frames(
         drift *= np.clip(np.abs(onset - time) / max(onset - time[np.argmax(contact)], 1e-9), 0, 1)
     normal = np.maximum(at.normal_n, threshold)
     variance = (
-        (at.tangential_sigma_n / (friction.mu * normal)) ** 2
-        + (used * at.normal_sigma_n / normal) ** 2
+        (at.tangential_noise_n**2 + at.tangential_tare_n**2) / (friction.mu * normal) ** 2
+        + (at.normal_noise_n**2 + at.normal_tare_n**2) * (used / normal) ** 2
         + (used * friction.sigma / friction.mu) ** 2
     )
     sigma = np.sqrt(variance + swing**2 + (used * drift) ** 2)
@@ -149,7 +115,7 @@ def label_frames(
     fault = np.zeros(len(time), dtype=np.int64) if screened is None else screened.codes_at(time, window_s=window)
     for first, last in settings.bad_frames:
         fault[first : last + 1] = MARKED
-    reliable = contact & ~at.missing & (fault == 0)
+    reliable = contact & ~missing & (fault == 0)
     slip_s = friction.onset_s
     if slip_s is None and np.any(outside := reliable & (used > 1 + sigma)):
         slip_s = float(time[np.argmax(outside)])
@@ -160,13 +126,13 @@ def label_frames(
         anew_s = next((start_s for start_s, _ in touches if start_s > onset_s), np.inf)
         slipped |= (time >= onset_s) & (time < anew_s)
     margin = safety_margin(np.where(contact, at.normal_n, 0.0), at.tangential_n, friction.mu)
-    margin = np.where(at.missing | (fault > 0), np.nan, np.where(slipped & contact, 0.0, margin))
+    margin = np.where(missing | (fault > 0), np.nan, np.where(slipped & contact, 0.0, margin))
     valid = reliable & ~slipped & (sigma <= LARGEST_SIGMA)
     holds = np.where(slipped & contact & (at.tangential_n > 0), used * friction.mu, friction.mu)
     return FoundLabels(
         force_time_s=time,
-        normal_force_n=np.where(at.missing, np.nan, at.normal_n),
-        tangential_force_n=np.where(at.missing, np.nan, at.tangential_n),
+        normal_force_n=np.where(missing, np.nan, at.normal_n),
+        tangential_force_n=np.where(missing, np.nan, at.tangential_n),
         friction_coefficient=holds,
         safety_margin=margin,
         safety_margin_sigma=np.where(valid, sigma, np.nan),
@@ -177,7 +143,7 @@ def label_frames(
         reason=_first_of(
             _REASONS,
             *(fault == kind for kind in range(1, len(FAULTS))),
-            at.missing,
+            missing,
             ~contact,
             slipped,
             ~valid & bool(friction.notes),
@@ -195,7 +161,7 @@ def label_frames(
     )
 
 
-def _used(at: FrameForces, friction: FrictionEstimate, threshold_n: float) -> Frames:
+def _used(at: MeanForces, friction: FrictionEstimate, threshold_n: float) -> Frames:
     """Compute the used share of the friction, F_t / (mu F_n), with at least the threshold for F_n."""
     return at.tangential_n / (friction.mu * np.maximum(at.normal_n, threshold_n))
 
