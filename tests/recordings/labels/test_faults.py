@@ -160,6 +160,14 @@ def test_a_step_that_may_be_a_slip_names_the_option_that_says_so(trial: Trial):
     assert labels.basis.friction.mu == pytest.approx(STATIC, rel=0.03)
 
 
+def test_a_fall_that_the_contact_makes_up_for_before_it_slips_is_a_step(trial: Trial):
+    # from 0.63 N of pull to 0.33 N at constant normal force, as a slip would; and 0.60 N when it slips
+    knocked = trial.contact_n - 0.3 * (trial.time_s >= 3.6)[:, None] * np.array([0, 0.6, -0.8])
+    labels = trial.label(spoilt(replace(trial, contact_n=knocked)))
+    assert [(fault.kind, round(fault.start_s, 1)) for fault in labels.basis.faults] == [(Reason.STEP, 3.6)]
+    assert labels.basis.friction.mu == pytest.approx(STATIC, rel=0.03)
+
+
 def test_after_a_step_nothing_is_valid_and_what_is_before_stays(trial: Trial):
     labels = trial.label(spoilt(trial, put(99, lambda part: np.add(part, (0, 3, 0)))))
     time = trial.frame_time_s

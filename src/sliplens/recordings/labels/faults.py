@@ -38,6 +38,7 @@ _JUMP_SIGMAS, _BURST_SIGMAS = 7.0, 12.0  # the second of a change between sample
 _JUMP_SHARE, _BURST_SHARE = 0.04, 0.15
 _TILTED_SHARE = 0.2  # of a fall of the pull that may show along the normal: axes that are off by 11 degrees
 _REST_SHARE, _RELEASE_S = 0.1, 0.3  # of the load of a released object; longest release that looks like jumps
+_REGAINED = 0.8  # of the fall of a slip, that the pull of a sliding contact does not regain
 _SLIP_S = 0.1  # largest distance of a slip set by hand from its jump
 _BRIEF_S = 0.1  # a fault as short as this has ended when the force is back near its former value
 _ROUNDING = 1e-6  # of a mean of flags that are all 0
@@ -405,10 +406,14 @@ def _measure_fall(forces: Forces, force_n: Samples, group: list[int], normal: Ax
     released = float(np.linalg.norm(after)) <= near + _REST_SHARE * float(np.linalg.norm(before))
     if course[0, 0] <= near or not (falls and (slips or released)):
         return False, False
-    # kinetic friction is no more than static friction: a pull that is harder later shows that nothing slipped here
+    # kinetic friction is no more than static friction: a pull that is harder later shows that nothing slipped here, nor
+    # at a fall that the same contact makes up for without being seen to slip
     later = np.lib.stride_tricks.sliding_window_view(force_n[start:], count, axis=0).mean(axis=-1) @ basis.T
-    harder = later[:, 1] / np.maximum(later[:, 0], course[0, 0] / 2) > (course[0, 1] + near) / course[0, 0]
-    return not harder.any(), bool(slips and fallen[1] > _JUMP_SHARE * _load(forces.force_n))
+    ratio = later[:, 1] / np.maximum(later[:, 0], course[0, 0] / 2)
+    harder = np.any(ratio > (course[0, 1] + near) / course[0, 0])
+    held = np.cumsum(later[:, 0] < course[0, 0] / 2) == 0
+    harder |= slips and np.any(ratio[count:][held[count:]] > (course[-1, 1] + _REGAINED * fallen[1]) / course[0, 0])
+    return not harder, bool(slips and fallen[1] > _JUMP_SHARE * _load(forces.force_n))
 
 
 def _make_motion_test(frame_time_s: Times, image_motion: Times, forces: Forces, lag: Lag) -> ImageMotionTest:

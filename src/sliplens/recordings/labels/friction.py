@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -198,10 +199,12 @@ def estimate_friction(
     for start, end in spans:
         if slip_s is not None and start <= slip_s <= end:
             continue
-        falls = (_find_falls(mean, start_s=start, end_s=end, friction_change=friction_change) for mean in means)
-        times = next(filter(None, falls), [])
+        falls = [_find_falls(mean, start_s=start, end_s=end, friction_change=friction_change) for mean in means]
+        # where samples are missing, the faint falls as well: a clear one later may be that of a sliding contact
+        hidden = [time_s for time_s in chain(*falls) if np.ptp(_find_gap(forces.time_s, time_s)) > 0]
+        times = sorted({*next(filter(None, falls), []), *hidden})
         # a slip at which the image rests is less likely
-        visible = [time_s for time_s in times if (_image_sigmas(image, time_s) or 0) >= _IMAGE_SIGMAS]
+        visible = [time_s for time_s in times if _is_seen(image, *_find_gap(forces.time_s, time_s))]
         rough += (visible or times)[:1]
     slips: list[_Slip] = []
     for time_s in sorted(rough if slip_s is None else [*rough, slip_s]):
@@ -227,8 +230,8 @@ def estimate_friction(
             interval = f"{mu:.2g} with a 68 % interval from {low:.2g} to {high:.2g}, which is none"
             raise RecordingError(f"the slip at {first.time_s:.2f} s gives a friction of {interval}; give it with --mu")
         if first.time_s != slip_s:
-            visible = (_image_sigmas(image, first.time_s) or 0) >= _IMAGE_SIGMAS
-            method = "break of F_t / F_n" + (", seen in the image" if visible else "")
+            seen = _is_seen(image, *_find_gap(forces.time_s, first.time_s))
+            method = "break of F_t / F_n" + (", seen in the image" if seen else "")
     estimate = FrictionEstimate(
         mu=mu,
         low=low,
@@ -301,13 +304,8 @@ def _fit_slip(
 ) -> _Slip:
     """Fit the break of the ratio about the rough time of a slip."""
     time, step = forces.time_s, axes.typical_step(forces.time_s)
-    wide = (
-        (np.diff(time) > max(axes.longest_step(time), _GAP_S))
-        & (time[:-1] < rough_s + _STEP_S)
-        & (time[1:] > rough_s - _STEP_S)
-    )
-    hidden = bool(wide.any()) and reach_s > 0  # in a gap of the samples
-    between_s = float(time[np.argmax(wide)]), float(time[np.argmax(wide) + 1])
+    between_s = _find_gap(time, rough_s)
+    hidden = between_s[1] > between_s[0] and reach_s > 0
     until_s = between_s[0] if hidden else rough_s
 
     def fit_near(before_s: float) -> tuple[Break, float]:
@@ -412,16 +410,22 @@ def _find_falls(means: _MeanRatio, *, start_s: float, end_s: float, friction_cha
     return sorted(falls)
 
 
-def _image_sigmas(image: ImageMotion | None, onset_s: float) -> float | None:
-    """Return the largest image motion at the onset in standard deviations of that before; None if not measured."""
+def _find_gap(time_s: Samples, at_s: float) -> tuple[float, float]:
+    """Find the gap of the samples that lies at a time or close to it, from end to end; the time itself without one."""
+    wide = np.diff(time_s) > max(axes.longest_step(time_s), _GAP_S)
+    near = np.flatnonzero(wide & (time_s[:-1] < at_s + _STEP_S) & (time_s[1:] > at_s - _STEP_S))
+    return (float(time_s[near[0]]), float(time_s[near[0] + 1])) if len(near) else (at_s, at_s)
+
+
+def _is_seen(image: ImageMotion | None, begin_s: float, end_s: float) -> bool:
+    """Return True where the image moves far more within a time in which the contact begins to slip than before it."""
     if image is None:
-        return None
+        return False
     # the motion of a frame happens between it and the one before; a lag may be uncertain by a frame
-    step = axes.typical_step(image.time_s)
-    after = image.time_s - onset_s
-    quiet = image.motion[1:][(after[1:] < -3 * step) & (after[1:] > -_QUIET_S - 3 * step)]
-    burst = image.motion[1:][(after[1:] >= -2 * step) & (after[1:] <= 3 * step)]
+    step, time, motion = axes.typical_step(image.time_s), image.time_s[1:], image.motion[1:]
+    quiet = motion[(time - begin_s < -3 * step) & (time - begin_s > -_QUIET_S - 3 * step)]
+    burst = motion[(time - begin_s >= -2 * step) & (time - end_s <= 3 * step)]
     if len(quiet) < 3 or len(burst) == 0:
-        return None
+        return False
     middle, spread = axes.robust_spread(quiet)
-    return float((burst.max() - middle) / max(spread, 1e-9))
+    return bool(burst.max() - middle >= _IMAGE_SIGMAS * max(spread, 1e-9))
