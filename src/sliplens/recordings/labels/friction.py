@@ -196,18 +196,18 @@ def estimate_friction(
     spans = find_contacts(forces, contact_threshold_n=contact_threshold_n)
     means = [_mean_ratio(forces, window_s=window_s, contact_threshold_n=contact_threshold_n) for window_s in _WINDOWS_S]
     rough: list[float] = []
+    elsewhere: list[float] = []  # than the slip that is set
     for start, end in spans:
-        if slip_s is not None and start <= slip_s <= end:
-            continue
         falls = [_find_falls(mean, start_s=start, end_s=end, friction_change=friction_change) for mean in means]
         # where samples are missing, the faint falls as well: a clear one later may be that of a sliding contact
         hidden = [time_s for time_s in chain(*falls) if np.ptp(_find_gap(forces.time_s, time_s)) > 0]
         times = sorted({*next(filter(None, falls), []), *hidden})
         # a slip at which the image rests is less likely
         visible = [time_s for time_s in times if _is_seen(image, *_find_gap(forces.time_s, time_s))]
-        rough += (visible or times)[:1]
+        found = elsewhere if slip_s is not None and start <= slip_s <= end else rough
+        found += (visible or times)[:1]
     slips: list[_Slip] = []
-    for time_s in sorted(rough if slip_s is None else [*rough, slip_s]):
+    for time_s in [*sorted(rough if slip_s is None else [*rough, slip_s]), *elsewhere]:
         reach_s = 0.0 if time_s == slip_s else _REACH_S
         limits = {"contact_threshold_n": contact_threshold_n, "reach_s": reach_s, "draws": draws}
         try:
@@ -216,6 +216,7 @@ def estimate_friction(
             if mu is None and not slips:
                 raise
             slips.append(_Slip(time_s))  # the friction is known without it
+    other = slips.pop() if elsewhere else None
     # the window that shows most surely how far the ratio reaches
     mean = max(means, key=lambda mean: float(mean.least.max()))
     first = slips[0] if slips else None
@@ -240,7 +241,9 @@ def estimate_friction(
         onset_s=first and first.time_s,
         later_onsets_s=tuple(slip.time_s for slip in slips[1:]),
     )
-    notes, error = _find_contradictions(estimate, slips, mean, slip_s=slip_s, friction_change=friction_change)
+    notes, error = _find_contradictions(
+        estimate, slips, other, means=mean, slip_s=slip_s, friction_change=friction_change
+    )
     if not notes:
         return estimate
     half = float(np.hypot(estimate.sigma, error))
@@ -251,8 +254,9 @@ def estimate_friction(
 def _find_contradictions(
     friction: FrictionEstimate,
     slips: Sequence[_Slip],
-    means: _MeanRatio,
+    other: _Slip | None,
     *,
+    means: _MeanRatio,
     slip_s: float | None,
     friction_change: float,
 ) -> tuple[list[str], float]:
@@ -289,6 +293,14 @@ def _find_contradictions(
             notes.append(
                 f"F_t / F_n does not fall at the slip that was set to {slip_s:.2f} s: {levels}; set it where it falls"
             )
+    if other is not None and other.mu is not None and not declared:
+        apart = abs(other.mu - mu)
+        if apart > max(LAW_SIGMAS * np.hypot(friction.sigma, (other.high - other.low) / 2), _LAW_SHARE * mu):
+            falls = (
+                f"F_t / F_n falls from {other.mu:.2f} at {other.time_s:.2f} s, and the slip was set to {slip_s:.2f} s"
+            )
+            notes.append(f"{falls}, {counts}; set it where it falls")
+            error = max(error, apart)
     return notes, error
 
 
