@@ -25,15 +25,6 @@ _NEGLIGIBLE = 1e-6
 _MOST_RATIOS, _FRESH_S = 120, 0.3  # ratios in memory; largest age of a ratio at a slip: an older one is too small
 
 
-def require_friction(value: float) -> None:
-    """Refuse a number that cannot be a coefficient of friction."""
-    if not 0 < value <= MOST_FRICTION:
-        raise InputError(
-            f"a coefficient of friction is a positive number up to {MOST_FRICTION:g}, got {value:g}; give F_t / F_n at "
-            "which the object slips, such as 0.6"
-        )
-
-
 @dataclass(frozen=True, eq=False)
 class Friction:
     """A coefficient of friction mu, with its uncertainty: possible values and their probabilities.
@@ -71,8 +62,11 @@ class Friction:
     def __post_init__(self) -> None:
         values = np.atleast_1d(np.asarray(self.values, dtype=np.float64))
         weights = np.ones(len(values)) if self.weights is None else np.asarray(self.weights, dtype=np.float64)
-        for value in values.tolist():
-            require_friction(value)
+        if not np.all(possible := (values > 0) & (values <= MOST_FRICTION)):
+            raise InputError(
+                f"a coefficient of friction is a positive number up to {MOST_FRICTION:g}, got "
+                f"{values[~possible][0]:g}; give F_t / F_n at which the object slips, such as 0.6"
+            )
         if weights.shape != values.shape or not (np.all(weights >= 0) and 0 < weights.sum() < math.inf):
             raise InputError(f"{len(values)} values of friction need as many weights, none negative and not all zero")
         object.__setattr__(self, "values", values)

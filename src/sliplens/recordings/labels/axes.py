@@ -336,13 +336,8 @@ class ContactForces:
         """Times of the samples."""
         return self.recorded.time_s
 
-    @property
-    def noise_n(self) -> tuple[float, float]:
-        """Standard deviation of a sample's noise: of the normal force, and of a tangential component."""
-        return self._split(self.axes.noise_n)
-
     def tare_sigma_n(self, time_s: Times) -> tuple[Times, Times]:
-        """Return the standard uncertainty of the tare, in which drifts count as errors, as `noise_n`."""
+        """Return the standard uncertainty of the tare and its drift: of the normal force, and of the tangential one."""
         normal, tangential = self._split(self.axes.tare_sigma_n)
         tilt = self.axes.direction_sigma * np.abs(np.interp(time_s, self.time_s, self.normal_n))
         uneven = _UNEVEN_SHARE * np.array(self.axes.drift_n_s)
@@ -365,18 +360,18 @@ class ContactForces:
         more = np.sqrt(window_s / np.maximum(length, 1e-9))
         normal_noise, noise = (
             np.minimum(mean * more, max(sample, mean))
-            for mean, sample in zip(self.noise_of_means_n(window_s), self.noise_n, strict=True)
+            for mean, sample in zip(self.noise_of_means_n(window_s), self._split(self.axes.noise_n), strict=True)
         )
         return MeanForces(normal, magnitude(tangential, sigma_n=noise), normal_noise, noise, *self.tare_sigma_n(time_s))
 
     def noise_of_means_n(self, window_s: float) -> tuple[float, float]:
-        """Return `noise_n` of means over a window, measured on means, white or not."""
+        """Return the standard deviation of the noise of means over a window, measured on means, white or not."""
         time = self.time_s
         ends = float(time[0]), float(time[-1] - window_s / 2)
         apart = middles(time, *ends, width_s=window_s) if window_s > 0 else time
         means = mean_force(time, self.recorded.force_n, apart, window_s=window_s)
         # of too few means the spread is unknown: that of the samples stands for it
-        return self._split(noise_sigma(means)) if len(means) >= _FEW_MEANS else self.noise_n
+        return self._split(noise_sigma(means) if len(means) >= _FEW_MEANS else self.axes.noise_n)
 
     def _split(self, of_axes: Vector | Axes) -> tuple[float, float]:
         index = self.axes.normal_index

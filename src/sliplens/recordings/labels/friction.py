@@ -220,6 +220,7 @@ def estimate_friction(
     # the window that shows most surely how far the ratio reaches
     mean = max(means, key=lambda mean: float(mean.least.max()))
     first = slips[0] if slips else None
+    compared = other if mu is None else first
     if mu is not None:
         low, high, method = mu, mu, BY_HAND
     elif first is None or first.mu is None:
@@ -241,9 +242,7 @@ def estimate_friction(
         onset_s=first and first.time_s,
         later_onsets_s=tuple(slip.time_s for slip in slips[1:]),
     )
-    notes, error = _find_contradictions(
-        estimate, slips, other, means=mean, slip_s=slip_s, friction_change=friction_change
-    )
+    notes, error = _find_contradictions(estimate, compared, means=mean, slip_s=slip_s, friction_change=friction_change)
     if not notes:
         return estimate
     half = float(np.hypot(estimate.sigma, error))
@@ -253,24 +252,24 @@ def estimate_friction(
 
 def _find_contradictions(
     friction: FrictionEstimate,
-    slips: Sequence[_Slip],
-    other: _Slip | None,
+    slip: _Slip | None,
     *,
     means: _MeanRatio,
     slip_s: float | None,
     friction_change: float,
 ) -> tuple[list[str], float]:
-    """Compare a friction with the forces; returns the contradictions, and the error of the friction for them."""
+    """Compare a friction with the forces and a slip; returns contradictions, and the error of the friction for them."""
     mu, declared, ratio, time = friction.mu, friction.method == BY_HAND, means.ratio, means.time_s
     written = f"{mu:.2f}" if declared else f"{mu:.2f} ({friction.low:.2f} to {friction.high:.2f})"
     notes, error, counts = [], 0.0, "whose difference counts as an error of the friction"
-    if declared and slips and slips[0].mu is not None:
-        first, apart = slips[0], abs(slips[0].mu - mu)
-        if apart > max(LAW_SIGMAS * (first.high - first.low) / 2, _LAW_SHARE * mu):
-            slip = (
-                f"F_t / F_n is {first.mu:.2f} ({first.low:.2f} to {first.high:.2f}) at the slip at {first.time_s:.2f} s"
+    if slip is not None and slip.mu is not None:
+        apart = abs(slip.mu - mu)
+        if apart > max(LAW_SIGMAS * np.hypot(friction.sigma, (slip.high - slip.low) / 2), _LAW_SHARE * mu):
+            falls = f"F_t / F_n is {slip.mu:.2f} ({slip.low:.2f} to {slip.high:.2f}) at the slip at {slip.time_s:.2f} s"
+            origin = "was given" if declared else f"follows from the slip that was set to {friction.onset_s:.2f} s"
+            notes.append(
+                f"{falls}, and a friction of {written} {origin}, {counts}; leave it out, or set --slip-s there"
             )
-            notes.append(f"{slip}, and a friction of {written} was given, {counts}; leave --mu out, or give --slip-s")
             error = apart
     highest = int(np.argmax(means.least))
     # the uncertainty of a friction that comes from these forces includes their tare
@@ -293,14 +292,6 @@ def _find_contradictions(
             notes.append(
                 f"F_t / F_n does not fall at the slip that was set to {slip_s:.2f} s: {levels}; set it where it falls"
             )
-    if other is not None and other.mu is not None and not declared:
-        apart = abs(other.mu - mu)
-        if apart > max(LAW_SIGMAS * np.hypot(friction.sigma, (other.high - other.low) / 2), _LAW_SHARE * mu):
-            falls = (
-                f"F_t / F_n falls from {other.mu:.2f} at {other.time_s:.2f} s, and the slip was set to {slip_s:.2f} s"
-            )
-            notes.append(f"{falls}, {counts}; set it where it falls")
-            error = max(error, apart)
     return notes, error
 
 
