@@ -233,10 +233,10 @@ def test_a_slip_that_missing_samples_hide_lies_anywhere_among_them(
     kept = (forces.time_s < begin_s) | (forces.time_s > begin_s + length_s)
     labels = trial.label(replace(forces, time_s=forces.time_s[kept], force_n=forces.force_n[kept]))
     friction = labels.basis.friction
-    # the ratio rises by 0.2 a second; without an untouched end the zero may drift, of 100 samples a second by 0.04 N
+    # the ratio rises by 0.2 a second; without an untouched end the zero may drift, of 100 samples a second by 0.05 N
     half = STATIC / (SLIP_S - PULL_S) * length_s / 2
     assert abs(friction.mu - STATIC) < half + 0.02
-    assert friction.sigma < half + 0.03
+    assert friction.sigma < half + 0.04
     before = (trial.frame_time_s > PULL_S) & (trial.frame_time_s < begin_s - 0.05)
     assert labels.valid[before].all()
     error = np.abs(labels.safety_margin - trial.truth)[before]
