@@ -163,7 +163,9 @@ def doubt_agreement(
     time = frame_time_s - lag.lag_s
     change = np.append(np.nan, force_changes(time, forces))
     covered = np.isfinite(change)
-    spans = _find_loads(forces)
+    load, still_until_s = _measure_load(forces)
+    loaded = (load > _LOADED_SHARE * float(np.quantile(load, 0.95))) & (forces.time_s >= still_until_s)
+    spans = [forces.time_s[[start, end - 1]] for start, end in find_spans(forces.time_s, loaded, apart_s=_APART_S)]
     near = [(time >= start - _APART_S) & (time <= end + _APART_S) for start, end in spans]
     doubts = []
     for inside in near or [np.ones(len(time), dtype=bool)]:
@@ -189,14 +191,6 @@ def doubt_agreement(
                 f"{correlation:.2f}); check that the force sensor ran"
             )
     return tuple(doubts)
-
-
-def _find_loads(forces: Forces) -> list[tuple[float, float]]:
-    """Find the stretches, in seconds, in which the force departs from that of the untouched sensor."""
-    time, (load, still_until_s) = forces.time_s, _measure_load(forces)
-    loaded = (load > _LOADED_SHARE * float(np.quantile(load, 0.95))) & (time >= still_until_s)
-    spans = find_spans(time, loaded, apart_s=_APART_S)
-    return [(float(time[start]), float(time[end - 1])) for start, end in spans]
 
 
 def _measure_load(forces: Forces) -> tuple[Float[np.ndarray, " samples"], float]:
