@@ -411,8 +411,8 @@ def _measure_fall(forces: Forces, force_n: Samples, group: list[int], normal: Ax
     later = np.lib.stride_tricks.sliding_window_view(force_n[start:], count, axis=0).mean(axis=-1) @ basis.T
     ratio = later[:, 1] / np.maximum(later[:, 0], course[0, 0] / 2)
     harder = np.any(ratio > (course[0, 1] + near) / course[0, 0])
-    held = np.cumsum(later[:, 0] < course[0, 0] / 2) == 0
-    harder |= slips and np.any(ratio[count:][held[count:]] > (course[-1, 1] + _REGAINED * fallen[1]) / course[0, 0])
+    pressed = np.cumsum(later[:, 0] < course[0, 0] / 2) == 0
+    harder |= slips and np.any(ratio[count:][pressed[count:]] > (course[-1, 1] + _REGAINED * fallen[1]) / course[0, 0])
     return not harder, bool(slips and fallen[1] > _JUMP_SHARE * _load(forces.force_n))
 
 

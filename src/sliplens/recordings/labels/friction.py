@@ -204,8 +204,8 @@ def estimate_friction(
         times = sorted({*next(filter(None, falls), []), *hidden})
         # a slip at which the image rests is less likely
         visible = [time_s for time_s in times if _is_seen(image, *_find_gap(forces.time_s, time_s))]
-        found = elsewhere if slip_s is not None and start <= slip_s <= end else rough
-        found += (visible or times)[:1]
+        target = elsewhere if slip_s is not None and start <= slip_s <= end else rough
+        target += (visible or times)[:1]
     slips: list[_Slip] = []
     for time_s in [*sorted(rough if slip_s is None else [*rough, slip_s]), *elsewhere]:
         reach_s = 0.0 if time_s == slip_s else _REACH_S
