@@ -264,8 +264,8 @@ def _find_drift(
     calm = np.all(np.std(force[ends], axis=0) < _CALM_NOISES * noise + 1e-9)
     # the end is untouched where little load is left, of the drift before the touch if that is measured
     measured = np.linalg.norm(slope_sigma) * span_s < _MEASURED_SHARE * load
-    left = min(float(np.linalg.norm(offset - share * slope * span_s)) for share in (0.0, float(measured)))
-    if calm and time[-1] < moved_s and left < _RELEASED_SHARE * load:
+    rest_n = min(float(np.linalg.norm(offset - share * slope * span_s)) for share in (0.0, float(measured)))
+    if calm and time[-1] < moved_s and rest_n < _RELEASED_SHARE * load:
         real = np.abs(offset) > np.maximum(_DRIFT_SIGMAS * unsure, _DRIFT_SHARE * load)
         return np.where(real, offset / span_s, 0.0), unsure / span_s
     return np.where(real, slope, 0.0), np.where(real, 1.0, _UNCERTAIN_SHARE) * slope_sigma

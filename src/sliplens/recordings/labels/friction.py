@@ -232,8 +232,8 @@ def estimate_friction(
             interval = f"{mu:.2g} with a 68 % interval from {low:.2g} to {high:.2g}, which is none"
             raise RecordingError(f"the slip at {first.time_s:.2f} s gives a friction of {interval}; give it with --mu")
         if first.time_s != slip_s:
-            seen = _is_seen(image, *_find_gap(forces.time_s, first.time_s))
-            method = "break of F_t / F_n" + (", seen in the image" if seen else "")
+            moves = _is_seen(image, *_find_gap(forces.time_s, first.time_s))
+            method = "break of F_t / F_n" + (", seen in the image" if moves else "")
     estimate = FrictionEstimate(
         mu=mu,
         low=low,
