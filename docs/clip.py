@@ -1,6 +1,6 @@
 """Draw the clip of the README: python docs/clip.py docs/images/grip.webp.
 
-The trial is the first dry one that tests of the preset `small`: chosen by its place, so that no answer plays a part.
+The trial is the first dry one that tests of the preset `small`: chosen by its number, not by its predictions.
 """
 
 import argparse
@@ -38,7 +38,7 @@ def draw_pictures(recording: Recording) -> Iterator[Image.Image]:
 
 
 def _draw(recording: Recording, rows: pa.Table, touched: np.ndarray, at: int, overlay: np.ndarray) -> Image.Image:
-    true, read = 100 * recording.safety_margin, 100 * column(rows, "prediction")
+    true, predicted = 100 * recording.safety_margin, 100 * column(rows, "prediction")
     low, high = 100 * column(rows, "low_90"), 100 * column(rows, "high_90")
     time_s, seen = recording.time_s, touched[touched <= at]
     with drawing_style():
@@ -55,15 +55,15 @@ def _draw(recording: Recording, rows: pa.Table, touched: np.ndarray, at: int, ov
         chart = figure.add_axes((0.665, 0.19, 0.32, 0.54))
         chart.fill_between(time_s[seen], low[seen], high[seen], color=BLUE, alpha=0.18, linewidth=0, label="90 %")
         chart.plot(time_s[touched], true[touched], color=BLACK, linestyle="--", linewidth=1, label="true")
-        chart.plot(time_s[seen], read[seen], color=BLUE, label="read")
-        chart.plot(time_s[at], read[at], color=BLUE, marker="o", markersize=5)
+        chart.plot(time_s[seen], predicted[seen], color=BLUE, label="predicted")
+        chart.plot(time_s[at], predicted[at], color=BLUE, marker="o", markersize=5)
         chart.set(xlim=(time_s[touched[0]], time_s[touched[-1]]), ylim=(-4, 104), yticks=(0, 50, 100))
         chart.set_xlabel("time (s)", fontsize=8)
         chart.tick_params(labelsize=8)
         chart.legend(loc="lower left", fontsize=7)
-        figure.text(0.665, 0.9, f"safety margin {read[at]:.0f} %", fontsize=15, fontweight="bold", color=BLUE)
-        told = f"90 % interval {low[at]:.0f} to {high[at]:.0f} %, true {true[at]:.0f} %"
-        figure.text(0.665, 0.81, told, fontsize=9, color=GREY)
+        figure.text(0.665, 0.9, f"safety margin {predicted[at]:.0f} %", fontsize=15, fontweight="bold", color=BLUE)
+        caption = f"90 % interval {low[at]:.0f} to {high[at]:.0f} %, true {true[at]:.0f} %"
+        figure.text(0.665, 0.81, caption, fontsize=9, color=GREY)
         canvas.draw()
     return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
 
