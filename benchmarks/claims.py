@@ -20,7 +20,7 @@ from torch.nn import functional
 
 import sliplens as sl
 from sliplens.cli.console import Terminal
-from sliplens.codec import save_record
+from sliplens.codec import write_json
 from sliplens.intervals import Difference, mean_interval, paired_difference
 from sliplens.plots.style import UNKNOWN, input_name, inputs_in_order, method_name
 from sliplens.recordings import Dataset
@@ -457,7 +457,7 @@ def main() -> None:
         shift_frames=frames,
     )
     if options.write:
-        save_record(record, RECORD)
+        write_json(RECORD, record)
     outcomes = {f"{row.claim}, {row.subject}": [row.outcome, row.thesis, row.ours] for row in record.claims}
     result = {"claims": outcomes, "shift": {point.shift_px: point.r2 for point in shift}}
     print(json.dumps(result, indent=None if options.json else 2))

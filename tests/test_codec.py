@@ -18,8 +18,8 @@ from sliplens.codec import (
     load_record,
     load_result,
     read_written,
-    save_record,
     save_result,
+    write_json,
     write_tables,
 )
 from sliplens.errors import InputError
@@ -209,7 +209,7 @@ def test_maps_of_another_shape_are_told(tmp_path):
 
 def test_a_number_that_is_not_finite_is_never_written(tmp_path):
     with pytest.raises(ValueError, match="not JSON compliant"):
-        save_record(Part(name="a", error=float("nan"), curve=()), tmp_path / "part.json")
+        write_json(tmp_path / "part.json", Part(name="a", error=float("nan"), curve=()))
     assert not (tmp_path / "part.json").exists()
 
 
@@ -221,7 +221,7 @@ def test_a_record_alone_comes_back(tmp_path: Path):
         config: object  # as JSON holds it
 
     place = Place(folder=tmp_path, share=0.5, config={"a": [1, 2]})
-    save_record(place, tmp_path / "place.json")
+    write_json(tmp_path / "place.json", place)
     assert load_record(tmp_path / "place.json", Place, command="sliplens x") == place
 
 

@@ -64,7 +64,7 @@ def test_a_part_is_made_once_and_only_what_is_missing_is_made_again(log: Path, o
 def test_whatever_shapes_a_part_names_it():
     same = {"trial": "a", "frames": 3, "recipe": 1, "content": "a"}
     others = [{"frames": 4}, {"first": 1}, {"content": "b"}, {"recipe": 2}]
-    keys = [part("a", **{**same, **change}).key for change in [{}, *others]]  # pyright: ignore[reportArgumentType]
+    keys = [part("a", **{**same, **change}).path for change in [{}, *others]]  # pyright: ignore[reportArgumentType]
     assert len(set(keys)) == len(keys)
 
 

@@ -203,13 +203,8 @@ class Columns(_Described):
         return cls(**{name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in names})
 
 
-def save_record(record: object, path: Path) -> None:
-    """Write a record as one indented JSON file, whole or not at all; numbers are finite, for JSON has no NaN."""
-    write_json(path, record)
-
-
 def load_record(path: Path, kind: type[Record], *, command: str) -> Record:
-    """Read a dataclass that `save_record` wrote; a mistake names the command that makes the file again.
+    """Read a dataclass that `write_json` wrote; a mistake names the command that makes the file again.
 
     Raises
     ------
@@ -262,7 +257,7 @@ def save_result(result: object, folder: Path) -> None:
     if arrays:
         with whole_file(folder / ARRAYS_FILE) as part, part.open("wb") as stream:
             np.savez_compressed(stream, **arrays)  # pyright: ignore[reportArgumentType]
-    save_record(short, folder / RESULT_FILE)  # last: a folder with this file is whole
+    write_json(folder / RESULT_FILE, short)  # last: a folder with this file is whole
 
 
 def load_result(folder: Path, kind: type[Record], *, command: str) -> Record:
@@ -275,14 +270,10 @@ def load_result(folder: Path, kind: type[Record], *, command: str) -> Record:
     """
     path, cure = folder / RESULT_FILE, _cure(command)
     content = _read_json(path, command)
-    if not isinstance(content, dict):
-        raise InputError(f"{path} holds no JSON object; {cure}")
-    declared = get_type_hints(kind, include_extras=True)
+    declared, stored = get_type_hints(kind, include_extras=True), {}
     arrays = {name: hint for name, hint in declared.items() if _is_array(hint)}
-    kinds = {name: get_args(hint) or (hint,) for name, hint in declared.items()}  # of `X` or `X | None`
-    tables = {
-        name: each[0] for name, each in kinds.items() if isinstance(each[0], type) and issubclass(each[0], Columns)
-    }
+    kinds = {name: (get_args(hint) or (hint,))[0] for name, hint in declared.items()}  # of `X` or `X | None`
+    tables = {name: each for name, each in kinds.items() if isinstance(each, type) and issubclass(each, Columns)}
     # one dataclass of what is in the JSON, so that msgspec checks it as declared; defaults are kept
     inside = [field for field in fields(kind) if field.name not in {*arrays, *tables}]  # pyright: ignore[reportArgumentType]
     partial = make_dataclass(kind.__name__, [(field.name, declared[field.name], copy(field)) for field in inside])
@@ -293,7 +284,6 @@ def load_result(folder: Path, kind: type[Record], *, command: str) -> Record:
         absent = NoneType in get_args(declared[name]) and content.get(name, ...) is None
         values[name] = None if absent else _load_columns(folder / f"{name}.parquet", table, cure)
     path = folder / ARRAYS_FILE
-    stored = {}
     if arrays:
         room = max(_MOST_REPEATED, MOST_TIMES * require_file(path, missing=cure))
         try:
@@ -375,14 +365,9 @@ def open_parquet(
         if not COLUMN_KINDS[kind](kinds[name][0]):
             raise error(f"{path} holds {kinds[name][0]} as {name!r} where {kind} belong; {cure}")
     expanded = sum(chunk.total_uncompressed_size for chunk in chunks)
-    repeated = max(
-        (
-            chunk.total_uncompressed_size * chunk.num_values
-            for chunk in chunks
-            if columns.get(chunk.path_in_schema) in {"bytes", "values"} and "DICT" in str(chunk.encodings)
-        ),
-        default=0,
-    )
+    listed = [chunk for chunk in chunks if columns.get(chunk.path_in_schema) in {"bytes", "values"}]
+    once = [chunk for chunk in listed if "DICT" in str(chunk.encodings)]
+    repeated = max((chunk.total_uncompressed_size * chunk.num_values for chunk in once), default=0)
     if rows > _MOST_ROWS or expanded > max(MOST_EXPANDED, MOST_TIMES * size) or repeated > _MOST_REPEATED:
         raise error(f"{path} has {size:,} bytes and claims {rows:,} rows of {expanded:,} bytes; {cure}")
     return file
@@ -428,15 +413,13 @@ def _require_array(values: np.ndarray, hint: Any, *, fits: bool, name: str, path
     if not fits:
         actual = f"{values.dtype} of shape {values.shape}"
         raise InputError(f"{path} holds {actual} as {name!r} where {_words_of(hint)} belongs; {cure}")
-    bounds = next((fact for fact in facts if isinstance(fact, msgspec.Meta)), None)
-    if bounds is None:
-        return
-    numbers = values[~np.isnan(values)] if UNKNOWN in facts else values
-    for extreme in (numbers.min(), numbers.max()) if numbers.size else ():  # NaN where one is
-        try:
-            msgspec.convert(float(extreme), Annotated[float, bounds])
-        except msgspec.ValidationError as error:
-            raise InputError(f"{path} holds {extreme:g} as {name!r} ({error}); {cure}") from None
+    for bounds in (fact for fact in facts if isinstance(fact, msgspec.Meta)):
+        numbers = values[~np.isnan(values)] if UNKNOWN in facts else values
+        for extreme in (numbers.min(), numbers.max()) if numbers.size else ():  # NaN where one is
+            try:
+                msgspec.convert(float(extreme), Annotated[float, bounds])
+            except msgspec.ValidationError as error:
+                raise InputError(f"{path} holds {extreme:g} as {name!r} ({error}); {cure}") from None
 
 
 def _load_columns(path: Path, kind: type[_Columns], cure: str) -> _Columns:
@@ -530,7 +513,7 @@ def _cure(command: str) -> str:
     return f"make it again with `{command}`"
 
 
-def _read_json(path: Path, command: str) -> object:
+def _read_json(path: Path, command: str) -> Any:
     return read_json(path, missing=f"make it with `{command}`", damaged=_cure(command))
 
 
@@ -540,6 +523,6 @@ def one_line(error: Exception) -> str:
 
 
 __all__ = [
-    "Columns", "Result", "from_builtins", "load_record", "load_result", "save_record", "save_result",
-    "to_builtins", "write_tables",
+    "Columns", "Result", "from_builtins", "load_record", "load_result", "save_result", "to_builtins", "write_json",
+    "write_tables",
 ]  # fmt: skip

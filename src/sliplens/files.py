@@ -107,7 +107,7 @@ def hash_tree(path: Path) -> str:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a value as indented JSON, whole or not at all."""
+    """Write a record or another value as indented JSON, whole or not at all; JSON has no NaN."""
     text = json.dumps(to_builtins(value), indent=2, allow_nan=False) + "\n"
     with whole_file(path) as part:
         part.write_text(text, encoding="utf-8")
@@ -225,8 +225,7 @@ def find_run(run: Path) -> Path:
     names = shipped_names()
     if str(run) in names:
         return _WEIGHTS / run
-    shipped = f", or name {' or '.join(names)}, which comes with sliplens" if names else ""
-    raise InputError(f"the run {run} does not exist; check the path{shipped}")
+    raise InputError(f"the run {run} does not exist; check the path, or name one of sliplens: {', '.join(names)}")
 
 
 @contextmanager
@@ -277,9 +276,7 @@ def locked(target: Path) -> Iterator[None]:
         target.parent.mkdir(parents=True, exist_ok=True)
         lock.acquire()
     except Timeout:
-        raise InputError(
-            f"another sliplens is writing {target}; wait until it is done, or choose another name"
-        ) from None
+        raise InputError(f"another sliplens is writing {target}; wait, or choose another name") from None
     except OSError as error:
         why = error.strerror
         raise InputError(f"cannot write to {target.parent} ({why}); choose another output folder") from None

@@ -131,10 +131,8 @@ def read_image(
     """
     with _open_image(source, where := where or str(source), cure) as image:
         if size is not None and (actual := _upright_size(image)) != tuple(size):
-            raise ImageError(
-                f"{where} is {actual[0]} x {actual[1]} pixels, {size[0]} x {size[1]} are needed; "
-                "use frames of the sensor the network was trained for"
-            )
+            sizes = f"{actual[0]} x {actual[1]} pixels, {size[0]} x {size[1]} are needed"
+            raise ImageError(f"{where} is {sizes}; use frames of the sensor the network was trained for")
         pixels = np.array(image if _orientation(image) == 1 else ImageOps.exif_transpose(image))
         return pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)
 
@@ -304,10 +302,8 @@ def require_rgb(images: Images, *, what: str = "frames") -> None:
         cure = _CURES.get(images.dtype.kind, "give the levels of the camera, from 0 to 255")
         raise ImageError(f"the {what} hold {images.dtype}, and sliplens takes 8-bit RGB (uint8); {cure}")
     if images.ndim < 3 or images.shape[-1] != 3:
-        raise ImageError(
-            f"the {what} have shape {tuple(images.shape)}, which does not end in (height, width, 3); give RGB images "
-            "with the colours on the last axis, a grey one as three equal colours"
-        )
+        shape = f"shape {tuple(images.shape)}, which does not end in (height, width, 3)"
+        raise ImageError(f"the {what} have {shape}; give RGB images with the colours on the last axis, grey as three")
 
 
 def as_frames(images: Images, *, what: str = "frames") -> UInt8[np.ndarray, "frames height width 3"]:
@@ -356,7 +352,4 @@ def require_same_size(frames: np.ndarray, reference: np.ndarray) -> None:
     require_rgb(reference, what="levels of the reference")
     if frames.shape[-3:] != reference.shape:
         frame, untouched = (f"{image.shape[-3]} x {image.shape[-2]}" for image in (frames, reference))
-        raise ImageError(
-            f"frame of {frame} pixels against a reference of {untouched}; "
-            "record the reference with the same camera settings"
-        )
+        raise ImageError(f"frame of {frame} pixels against a reference of {untouched}; record both alike")

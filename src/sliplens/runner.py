@@ -51,7 +51,6 @@ from sliplens.progress import OnProgress, counting, current_reporter, open_stage
 LONGEST = 8192
 """Largest number of frames of a part; a longer trial is divided."""
 _LONGEST_NAME = 200  # of a folder; file systems take 255 bytes
-_PART = re.compile(r"\d{8}-(\d+)-([0-9a-f]{16})(\.\w+)?")
 _FATAL = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}  # no other part could be written either
 
 MakePart: TypeAlias = Callable[[Any, Path], None]
@@ -84,14 +83,7 @@ class Part:
     """Name in messages, such as `trial-012 from frame 8192`."""
     frames: int
     path: str
-    """Path in the folder of all parts."""
-
-    @property
-    def key(self) -> str:
-        """Hash of everything that shapes the part."""
-        match = _PART.fullmatch(self.path.rpartition("/")[2])
-        assert match is not None
-        return match[2]
+    """Path in the folder of all parts, with a hash of everything that shapes the part."""
 
 
 def part(
@@ -124,7 +116,6 @@ def run_parts(
     folder: Path,
     *,
     on: str = "serial",
-    on_part: Callable[[Part], None] | None = None,
 ) -> None:
     """Make the parts that are missing in a folder; one that fails does not stop the others.
 
@@ -134,8 +125,6 @@ def run_parts(
     ----------
     on
         Row of `EXECUTORS` with its argument: `serial`, `processes`, `processes=4`, `ray`, `ray=ADDRESS`.
-    on_part
-        Called with each part once it exists.
 
     Raises
     ------
@@ -146,17 +135,22 @@ def run_parts(
     """
     name, _, argument = on.partition("=")
     executor = pick(EXECUTORS, name, noun="executor")
-    frames = sum(each.frames for each in parts)
-    tally, missing = _Tally(frames), deque[Part]()
+    total, done, shares = sum(each.frames for each in parts), 0, dict[str, int]()
+    report, lock, missing = current_reporter(), threading.Lock(), deque[Part]()
 
-    def made(each: Part) -> None:
-        tally.count(each, 1, 1)
-        if on_part is not None:
-            on_part(each)
+    def count(each: Part, made: int, of: int) -> None:
+        """Report that a share of a part is done; 0 again if it failed."""
+        nonlocal done
+        with lock:
+            frames = each.frames * made // max(of, 1)
+            more = frames - shares.get(each.path, 0)
+            shares[each.path], done = frames, done + more
+            if more > 0:
+                report(done, total)
 
     for each in parts:
         if (folder / each.path).exists():
-            made(each)
+            count(each, 1, 1)
         else:
             missing.append(each)
     errors: dict[str, Exception] = {}
@@ -165,23 +159,19 @@ def run_parts(
             remove(draft)
         folder.mkdir(parents=True, exist_ok=True)
         with executor(work, argument, len(missing)) as pool:
-            errors = _run(pool, missing, folder, tally.count, made)
+            errors = _run(pool, missing, folder, count)
     for error in errors.values() if len(parts) == 1 else ():
         raise error
     if errors:
-        raise PartError({name: _sentence(error) for name, error in errors.items()}, parts=len(parts))
-
-
-def _sentence(error: Exception) -> str:
-    return str(error) if isinstance(error, SliplensError) else f"{type(error).__name__}: {error}"
+        sentences = {
+            name: str(error) if isinstance(error, SliplensError) else f"{type(error).__name__}: {error}"
+            for name, error in errors.items()
+        }
+        raise PartError(sentences, parts=len(parts))
 
 
 def _run(
-    pool: "_Pool",
-    missing: deque[Part],
-    folder: Path,
-    count: Callable[[Part, int, int], None],
-    made: Callable[[Part], None],
+    pool: "_Pool", missing: deque[Part], folder: Path, count: Callable[[Part, int, int], None]
 ) -> dict[str, Exception]:
     """Submit parts until none is missing; return the errors by the name of the part."""
     running: dict[Future, Part] = {}
@@ -202,12 +192,12 @@ def _run(
                 error = future.result()
             except pool.lost:
                 error = SliplensError("its process was ended from outside, perhaps for want of memory")
-                if each.key not in lost:
-                    lost.add(each.key)
+                if each.path not in lost:
+                    lost.add(each.path)
                     alone.append(each)
                     continue
             if error is None:
-                made(each)
+                count(each, 1, 1)
                 continue
             if isinstance(error, _PreparationError):
                 raise error.args[0]
@@ -240,24 +230,6 @@ def _make(prepare: Callable[[], MakePart], folder: Path, each: Part) -> Exceptio
     finally:
         remove(draft)
     return None
-
-
-class _Tally:
-    """Frames done so far, reported as they change."""
-
-    def __init__(self, total: int) -> None:
-        self._total, self._done, self._by_part = total, 0, dict[str, int]()
-        self._report, self._lock = current_reporter(), threading.Lock()
-
-    def count(self, each: Part, done: int, total: int) -> None:
-        """Report that a share of a part is done; 0 again if it failed."""
-        with self._lock:
-            frames = each.frames * done // max(total, 1)
-            more = frames - self._by_part.get(each.key, 0)
-            self._by_part[each.key] = frames
-            self._done += more
-            if more > 0:
-                self._report(self._done, self._total)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -437,24 +409,26 @@ def run_table(
             schema = make(output.folder)
             deque(rows(output.folder) if on_rows is not None else (), maxlen=0)
             return schema, None
-    if out is None:
-        with scratch_folder() as folder:
-            schema = make(folder)
-            return schema, write_tables(regrouped(rows(folder), rows=LONGEST), None, schema)
+    with scratch_folder() if out is None else _parts_beside(out, resumable=resumable, overwrite=overwrite) as folder:
+        schema = make(folder)
+        return schema, write_tables(regrouped(rows(folder), rows=LONGEST), out, schema)
+
+
+@contextmanager
+def _parts_beside(out: Path, *, resumable: bool, overwrite: bool) -> Iterator[Path]:
+    """Open the folder of the parts of a table, which stays after an interruption."""
     folder = partial_folder(out)
     with locked(out):
         require_new_file(out, overwrite=overwrite)
         if not resumable:
             remove(folder)
         try:
-            schema = make(folder)
-            write_tables(regrouped(rows(folder), rows=LONGEST), out, schema)
+            yield folder
         except BaseException:
             if not any(path.is_file() for path in folder.rglob("*")):
                 remove(folder)
             raise
         remove(folder)
-    return schema, None
 
 
 def require_new_table(path: Path, *, suffix: str | Sequence[str], overwrite: bool = False) -> None:

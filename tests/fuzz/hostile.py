@@ -424,6 +424,12 @@ def _video(folder: Path) -> None:
     write_video(make_recording("cup", frames=20), folder / "cup.mkv")
 
 
+def _npz(folder: Path) -> None:
+    frames = make_recording("cup", frames=20).frames
+    forces = {name: np.linspace(0, 2, 20) for name in ("fx", "fy", "fz")}
+    np.savez(folder / "cup.npz", allow_pickle=False, frames=frames, time_s=np.arange(20) / 30, **forces)
+
+
 def _bag(folder: Path) -> None:
     rng = np.random.default_rng(0)
     pixels = rng.integers(0, 256, (20, 12, 16, 3), dtype=np.uint8)
@@ -567,6 +573,7 @@ FORMATS = {
     "images": Format(_own, ("cup/0*.png",), PICTURE, _frames_of("cup", frame_rate=30.0)),
     "video": Format(_video, ("cup.mkv",), ANY, _frames_of("cup.mkv")),
     "bag": Format(_bag, ("bag/bag.mcap",), ANY, _frames_of("bag/bag.mcap")),
+    "npz": Format(_npz, ("cup.npz",), ARRAYS, _frames_of("cup.npz")),
     "toml": Format(_text("tip.toml"), ("*.toml",), TOML, _read_toml),
 }
 """Every kind of input."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sliplens.codec import save_record, save_result
+from sliplens.codec import save_result, write_json
 from sliplens.faithfulness.scoring import score_deletion
 from sliplens.files import Provenance, machine, versions
 from sliplens.recordings import TrialInfo
@@ -28,7 +28,7 @@ def write_run(folder: Path, stage: str, config: dict[str, Any], result: object, 
     folder.mkdir(parents=True)
     facts = {"versions": versions(), "machine": machine(), "finished": f"2026-11-21T04:{minute:02d}:00+00:00"}
     provenance = Provenance(stage=stage, config=config, config_hash=stage.encode().hex(), **facts)
-    save_record(provenance, folder / "run.json")
+    write_json(folder / "run.json", provenance)
     if is_dataclass(result):
         save_result(result, folder)
     else:

@@ -7,7 +7,7 @@ from typing import TypeVar
 import pytest
 
 from sliplens.errors import InputError
-from sliplens.recordings.formats import images, rosbag, tables, thesis, video
+from sliplens.recordings.formats import arrays, images, rosbag, tables, video
 from sliplens.recordings.options import ReadOptions
 
 Found = TypeVar("Found")
@@ -17,10 +17,10 @@ def _by_keyword(read: Callable[[Path, ReadOptions], Found]) -> Callable[..., Fou
     return lambda path, **options: read(path, ReadOptions(**options))
 
 
-read_force_table = _by_keyword(tables.read_force_table)
+read_arrays = _by_keyword(arrays.read_arrays)
+read_force_table = _by_keyword(lambda path, options: tables.read_force_table(tables.open_text_table(path), options))
 read_image_folder = _by_keyword(images.read_image_folder)
 read_rosbag = _by_keyword(rosbag.read_rosbag)
-read_thesis = _by_keyword(thesis.read_thesis)
 read_video = _by_keyword(video.read_video)
 
 

@@ -63,5 +63,5 @@ def test_what_does_not_fit_is_told(folder, small_dataset: Dataset):
         open_source(frames[:0])
     with pytest.raises(InputError, match="frames in memory do not take --skip-frames; leave it out"):
         open_source(frames, options=ReadOptions(frame_rate=4.0, skip_frames=1))
-    with pytest.raises(InputError, match=r"has no trial nothing; choose one such as"):
+    with pytest.raises(InputError, match=r"has no trial nothing; it has"):
         open_source(small_dataset, trial="nothing")

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from command_line import run
 
-from sliplens.codec import save_record
+from sliplens.codec import write_json
 from sliplens.report import Written, write_report
 from sliplens.results.study import CONFIG_FILE, StudyConfig
 
@@ -78,7 +78,7 @@ def test_a_stage_alone_makes_a_page_that_names_the_others(pristine_study, tmp_pa
 def test_a_page_misses_nothing_that_was_not_asked_for(pristine_study, tmp_path):
     for stage in ("choice", "states", "truth-raw"):
         shutil.copytree(pristine_study / stage, tmp_path / stage)
-    save_record(StudyConfig(tests=("truth",)), tmp_path / CONFIG_FILE)
+    write_json(tmp_path / CONFIG_FILE, StudyConfig(tests=("truth",)))
     assert missing(tmp_path) == "Accuracy, Saliency maps"
 
 

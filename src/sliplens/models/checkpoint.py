@@ -16,7 +16,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
-from sliplens.codec import load_record, load_result, save_record
+from sliplens.codec import load_record, load_result, write_json
 from sliplens.errors import CheckpointError, ImageError, InputError
 from sliplens.extras import pick, require_device
 from sliplens.files import DIFFERENCE_NETWORK, MANIFEST_FILE, find_run, hash_file, require_folder, whole_file
@@ -451,7 +451,7 @@ def save_checkpoint(
         hashed = _save_weights(folder / SEQUENCE_FILE, sequence)
         manifest = replace(manifest, sequence=replace(manifest.sequence, weights_sha256=hashed))
     hashed = _save_weights(folder / WEIGHTS_FILE, model)
-    save_record(replace(manifest, weights_sha256=hashed), folder / MANIFEST_FILE)
+    write_json(folder / MANIFEST_FILE, replace(manifest, weights_sha256=hashed))
 
 
 def _save_weights(path: Path, model: nn.Module) -> str:

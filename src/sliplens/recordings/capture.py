@@ -58,7 +58,7 @@ class Capture(TrialFacts):
     opened: str = "frames in memory"  #: Path that was opened, for messages and metadata.
 
     def __post_init__(self) -> None:
-        if len(self.frame_time_s) == 0:
+        if len(self) == 0:
             raise RecordingError(f"{self.source} has no frame; leave it out or record it again")
         if self.time_s is not None:
             require_rising(self.frame_time_s, what=f"the frames of {self.source}")

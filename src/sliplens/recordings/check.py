@@ -1,6 +1,6 @@
 """Checks of a data set: its files against their hashes, its labels against their laws."""
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -70,12 +70,11 @@ def check_dataset(
             violations.append(Violation(where=trial, what=f"is listed {count} times, in split {' and '.join(splits)}"))
     listed = {trial_path(folder, info.trial) for info in data.trials}
     listed |= {forces_path(folder, info.trial) for info in data.trials if info.forces_sha256}
-    for path in sorted({*(folder / "trials").glob("*"), *(folder / "forces").glob("*")} - listed):
-        where = str(path.relative_to(folder))
-        violations.append(Violation(where=where, what="is not in the table of the data set"))
+    unlisted = sorted({*(folder / "trials").glob("*"), *(folder / "forces").glob("*")} - listed)
+    what = "is not in the table of the data set"
+    violations += [Violation(where=str(path.relative_to(folder)), what=what) for path in unlisted]
     if (folder / JOURNAL_FOLDER).is_dir():
-        unfinished = "still runs or was cut off; finish it with sliplens recover"
-        violations.append(Violation(where=JOURNAL_FOLDER, what=unfinished))
+        violations.append(Violation(where=JOURNAL_FOLDER, what="still runs or was cut off; use sliplens recover"))
     # hashes and decoding release the interpreter's lock
     with reporting(on_progress):
         checked = in_turn(lambda info: tuple(_check_trial(folder, info)), data.trials)
@@ -98,9 +97,8 @@ def _find_shared(data: Dataset, other: Dataset) -> list[Violation]:
             # a simulated trial of the same seed is of the same touch, also where its frames are others
             names = [hash_frames(trial_path(each.folder, info.trial)), *([(*seeds[place], info.trial)] * any(seeds))]
             trials[place] |= dict.fromkeys(names, info.trial)
-            if info.sensor:
-                for fact in (f"the sensor {info.sensor}", f"day {info.day} of {info.sensor}"):
-                    circumstances[place][*seeds[place], fact] = fact
+            for fact in (f"the sensor {info.sensor}", f"day {info.day} of {info.sensor}") if info.sensor else ():
+                circumstances[place][*seeds[place], fact] = fact
     if both := [fact for key, fact in circumstances[0].items() if key in circumstances[1]]:
         add_note(f"{other.folder} has, too: {', '.join(both)}")
     shared = {name: trials[1][key] for key, name in trials[0].items() if key in trials[1]}
@@ -128,8 +126,8 @@ def _check_trial(folder: Path, info: TrialInfo) -> Iterator[str]:
     try:
         header = read_header(path)
         recording = load_recording(path, pixels=header.truth is not None)
-        for _ in stream_frames(path) if header.truth is None else ():
-            pass  # each can be decoded; one at a time, however many there are
+        if header.truth is None:
+            deque(stream_frames(path), maxlen=0)  # each can be decoded; one at a time, however many there are
     except SliplensError as error:
         yield f"cannot be read: {error}"
         return

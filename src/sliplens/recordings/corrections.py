@@ -3,6 +3,7 @@
 import csv
 import re
 import shlex
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from sliplens.recordings.labelling import Corrections
 from sliplens.recordings.labels.margin import require_inside
 from sliplens.recordings.manifest import Column, parse_cells, read_csv
 from sliplens.recordings.options import LabelSettings, TrialSettings
+from sliplens.recordings.sensor import SENSORS_FOLDER
 from sliplens.recordings.store import read_first_reference, read_header
 
 _SETTINGS = ("exclude", *(field.name for field in fields(TrialSettings)))
@@ -146,7 +148,7 @@ def label_dataset(
     """
     with reporting(on_progress):
         data = load_dataset(data)
-        labelling, out = labelling or LabelSettings(), data.folder if out is None else Path(out)
+        labelling, out = labelling or LabelSettings(), Path(out or data.folder)
         in_place = out.resolve() == data.folder.resolve()
         stored = {info.trial: read_header(trial_path(data.folder, info.trial)).labelling for info in data.trials}
         before = {trial: origin.corrections for trial, origin in stored.items() if origin and origin.corrections}
@@ -171,7 +173,8 @@ def label_dataset(
                 rows, _ = write_trials(work, items, folder, title="Labelling frames", on=on)
                 table = [replace(row, split=info.split) for row, info in zip(rows, data.trials, strict=True)]
                 dataset.write_dataset_table(folder, table, simulated=data.simulated, left_out=data.left_out)
-                dataset.copy_profiles(data.folder, folder)
+                if (data.folder / SENSORS_FOLDER).is_dir():
+                    shutil.copytree(data.folder / SENSORS_FOLDER, folder / SENSORS_FOLDER, dirs_exist_ok=True)
                 remove(folder / PARTS)
         if corrections:
             add_note(f"corrections of {number_of(len(corrections), 'trial')} applied")
@@ -194,8 +197,7 @@ class _Relabelling(TrialWork):
         info, folder = self.data.trials[item], self.data.folder
         capture = self.data.open(info)
         if capture.forces is None:
-            no_forces = f"{info.trial} of {folder} has no forces, and without them there is no label"
-            raise InputError(f"{no_forces}; import it again with its table of forces")
+            raise InputError(f"{info.trial} of {folder} has no forces to label it by; import it again with their table")
         profile, corrections = self.data.profile(capture.sensor), self.corrections.get(info.trial)
         settings, cure = self.labelling if profile is None else profile.settings(self.labelling), ""
         if corrections is not None:

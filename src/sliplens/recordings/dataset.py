@@ -89,14 +89,16 @@ class Dataset(Result):
         some = ", ".join(dict.fromkeys(info.trial for info in (*self.trials[:5], self.trials[-1])))
         raise RecordingError(f"{self.folder} has no trial {trial}; it has {some}")
 
-    def select(self, *, split: str | None = None, condition: str | None = None) -> tuple[TrialInfo, ...]:
-        """Return the trials of a split and a condition; a `RecordingError` lists both if there is none."""
+    def select(
+        self, *, split: str | None = None, condition: str | None = None, trial: str | None = None
+    ) -> tuple[TrialInfo, ...]:
+        """Return the trials of a split, a condition and a name; a `RecordingError` lists those there are if none is."""
         chosen = [info for info in self.trials if split in {None, info.split} and condition in {None, info.condition}]
         if not chosen:
-            present = sorted({f"{trial.split}/{trial.condition}" for trial in self.trials})
+            present = sorted({f"{info.split}/{info.condition}" for info in self.trials})
             wanted = f"split {split or 'any'} and condition {condition or 'any'}"
             raise RecordingError(f"{self.folder} has no trial with {wanted}; it has {', '.join(present)}")
-        return tuple(chosen)
+        return tuple(chosen) if trial is None else (replace(self, trials=tuple(chosen)).find(trial),)
 
     def load(self, info: TrialInfo, *, truth: bool = True) -> Recording:
         """Read one trial with its frames, and with the ground truth of a simulated one unless `truth` is False."""
@@ -219,8 +221,8 @@ def begin_recording(folder: Path, *, simulated: bool) -> tuple[FileLock, tuple[s
         exists = (folder / DATASET_FILE).is_file()  # removed where nothing had been recorded
     table = _read(folder) if exists else Dataset(folder=folder, trials=(), simulated=simulated)
     if table.simulated != simulated:
-        kinds = ("simulated", "real") if table.simulated else ("real", "simulated")
-        raise RecordingError(f"{folder} holds {kinds[0]} trials, these are {kinds[1]}; choose another folder")
+        kind = "simulated" if simulated else "real"
+        raise RecordingError(f"{folder} holds {table.source} trials, these are {kind}; choose another folder")
     lock = lock_journals(folder)
     # also without a trial: whoever opens the folder sees a data set, and recovers it if it was cut off
     write_dataset_table(folder, table.trials, simulated=simulated, left_out=table.left_out)
@@ -267,12 +269,6 @@ def save_profile(folder: Path, profile: SensorProfile) -> None:
     path = folder / SENSORS_FOLDER / f"{profile.name}.toml"
     with whole_file(path) as part:
         part.write_text(profile_text(profile), encoding="utf-8")
-
-
-def copy_profiles(source: Path, folder: Path) -> None:
-    """Copy the sensor profiles of a data set into another folder."""
-    if (source / SENSORS_FOLDER).is_dir():
-        shutil.copytree(source / SENSORS_FOLDER, folder / SENSORS_FOLDER, dirs_exist_ok=True)
 
 
 def trial_path(folder: Path, trial: str) -> Path:

@@ -14,9 +14,9 @@ from typing import IO, Any, TypeAlias, TypedDict, Unpack
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from sliplens.codec import RESULT_FILE, load_record, save_record
+from sliplens.codec import RESULT_FILE, load_record
 from sliplens.errors import InputError, PartError, RecordingError, SliplensError
-from sliplens.files import output_folder, remove, whole_file
+from sliplens.files import output_folder, remove, whole_file, write_json
 from sliplens.images import Soft, require_rgb, soften
 from sliplens.progress import OnProgress, add_note, number_of, open_stage, report_each, report_progress, reporting
 from sliplens.recordings import dataset
@@ -28,7 +28,7 @@ from sliplens.recordings.labels.margin import label_trial
 from sliplens.recordings.labels.reference import choose_reference
 from sliplens.recordings.manifest import ManifestRow, find_rows
 from sliplens.recordings.options import LabelSettings, ReadOptions
-from sliplens.recordings.sensor import SensorProfile, is_profile, load_profile
+from sliplens.recordings.sensor import SENSORS_FOLDER, SensorProfile, is_profile, load_profile
 from sliplens.recordings.source import open_source
 from sliplens.recordings.splits import Group, SplitResult, assign_splits, load_splits, split_by_group
 from sliplens.recordings.store import decode_pixels, encode_pixels, forces_path, in_turn, save_forces, write_trial
@@ -66,7 +66,7 @@ class TrialWork(Work):
         def make(item: Any, folder: Path) -> None:
             job = self.open(item)
             import_trial(job, path := trial_path(folder, job.capture.trial))
-            save_record(dataset.trial_info(path, split=""), folder / RESULT_FILE)
+            write_json(folder / RESULT_FILE, dataset.trial_info(path, split=""))
 
         return make
 
@@ -86,7 +86,7 @@ def write_trials(
     """
     # the folder is of these recordings and settings alone (`files.output_folder`)
     every = [part(item, trial=name, frames=frames, recipe="trial", content=name) for item, name, frames in trials]
-    left_out: list[LeftOut] = []
+    failed: dict[str, LeftOut] = {}
     with threadpool_limits(1, user_api="blas"), open_stage(title):
         try:
             run_parts(work, every, folder / PARTS, on=on)
@@ -95,12 +95,11 @@ def write_trials(
                 raise
             for name, failure in error.errors.items():
                 why = f"{failure}; the same command with --add tries it again"
-                left_out.append(LeftOut(trial=name, source=(optional or {})[name], why=why))
-    if len(left_out) == len(trials):
+                failed[name] = LeftOut(trial=name, source=(optional or {})[name], why=why)
+    if len(failed) == len(trials):
         remove(folder / PARTS)
-        raise RecordingError(f"no trial could be imported; the first: {left_out[0].why}")
+        raise RecordingError(f"no trial could be imported; the first: {failed[trials[0][1]].why}")
     rows: list[TrialInfo] = []
-    failed = {trial.trial for trial in left_out}
     for made in (folder / PARTS / each.path for each in every if each.name not in failed):
         rows.append(load_record(made / RESULT_FILE, TrialInfo, command="the interrupted command"))
         for path in (trial_path(made, rows[-1].trial), forces_path(made, rows[-1].trial)):
@@ -108,14 +107,13 @@ def write_trials(
                 target = folder / path.relative_to(made)
                 target.parent.mkdir(exist_ok=True)
                 path.replace(target)
-    return rows, left_out
+    return rows, [*failed.values()]
 
 
 def require_forces(capture: Capture) -> None:
     """Refuse a recording that has neither labels nor forces to make them from."""
     if capture.labels is None and capture.forces is None:
-        cure = "give the table of the force sensor with --forces FILE, or under the name of the recording"
-        raise RecordingError(f"{capture.source} has no forces, and without them there is no label; {cure}")
+        raise RecordingError(f"{capture.source} has no forces to label it by; give their table with --forces FILE")
 
 
 def import_trial(job: TrialJob, path: Path) -> None:
@@ -126,7 +124,7 @@ def import_trial(job: TrialJob, path: Path) -> None:
     with tempfile.TemporaryFile(dir=path.parent) as file:
         footage = _Footage(capture, file)
         motion = measure_motion(footage.soften())
-        labels, untouched, basis = capture.labels, None, None
+        labels, untouched, basis = capture.labels, np.zeros(len(capture), dtype=np.bool_), None
         try:
             if labels is None and corrections is not None and corrections.exclude:
                 labels = labels_of_margins(np.full(len(capture), np.nan))
@@ -143,18 +141,15 @@ def import_trial(job: TrialJob, path: Path) -> None:
                 labels = label_by_friction(labels, settings.mu)
             index = capture.reference_index if settings.reference_frame is None else settings.reference_frame
             if capture.reference is not None and index is None:
-                method = "came with the recording" if untouched is None else "recorded apart from the frames"
+                method = "came with the recording" if basis is None else "recorded apart from the frames"
                 reference, choice = capture.reference, capture.reference_choice or ReferenceChoice(method=method)
             else:
-                of_forces = np.zeros(len(capture), dtype=np.bool_) if untouched is None else untouched
-                choice = choose_reference(footage.read, of_forces, index=index)
+                choice = choose_reference(footage.read, untouched, index=index)
                 (reference,) = footage.read([choice.index or 0])
         except RecordingError as error:
             raise RecordingError(f"{capture.source}: {error}{job.cure}") from None
-        first = None
-        if capture.reference is not None and corrections is not None and corrections.reference_frame is not None:
-            # for who takes the correction back
-            first = capture.reference_choice or ReferenceChoice(method="came with the recording")
+        # for who takes the correction back
+        replaced = capture.reference is not None and corrections is not None and corrections.reference_frame is not None
         labelling = labels.labelling or Labelling(
             source=capture.source,
             forces=capture.forces.source if capture.forces else None,
@@ -162,19 +157,21 @@ def import_trial(job: TrialJob, path: Path) -> None:
             reference=choice,
             basis=basis,
             corrections=corrections,
-            first_reference=first,
+            first_reference=(capture.reference_choice or ReferenceChoice(method="came with the recording"))
+            if replaced
+            else None,
         )
         # before the trial, whose file means that all of it is there
         if capture.forces is not None:
             save_forces(capture.forces, forces_path(path.parent.parent, path.stem))
         write_trial(
             path,
-            footage.images(),
+            map(footage.image, range(len(capture))),
             facts=capture,
             time_s=capture.frame_time_s,
             labels=replace(labels, labelling=labelling),
             reference=reference,
-            first_reference=capture.reference if labelling.first_reference is not None else None,
+            first_reference=capture.reference if labelling.first_reference else None,
         )
 
 
@@ -186,7 +183,7 @@ class _Footage:
 
     def soften(self) -> Iterator[Soft]:
         """Decode, check and spool the frames; yields them softened."""
-        capture = self.capture
+        capture, count = self.capture, 0
 
         def encode(item: tuple[int, Frame]) -> tuple[bytes, Soft]:
             number, frame = item
@@ -195,15 +192,16 @@ class _Footage:
                 raise RecordingError(f"frame {number} of {capture.source} is of another size; cut the recording there")
             return encode_pixels(frame), soften(frame)
 
-        for image, soft in in_turn(encode, enumerate(capture.read_frames())):
+        for count, (image, soft) in enumerate(in_turn(encode, enumerate(capture.read_frames())), start=1):
             self._file.write(image)
             self._ends.append(self._file.tell())
             yield soft
-            report_progress(len(self._ends) - 1, len(capture))
-        if (count := len(self._ends) - 1) != len(capture):
+            report_progress(count, len(capture))
+        if count != len(capture):
             raise RecordingError(f"{capture.source} promised {len(capture)} frames but gave {count}; copy it again")
 
-    def _image(self, place: int) -> bytes:
+    def image(self, place: int) -> bytes:
+        """Read an encoded frame."""
         self._file.seek(self._ends[place])
         return self._file.read(self._ends[place + 1] - self._ends[place])
 
@@ -211,11 +209,7 @@ class _Footage:
         """Read some frames."""
         for place in places:
             where = f"frame {place} of {self.capture.source}"
-            yield decode_pixels(self._image(place), size=(*self.capture.frame_size, 3), where=where)
-
-    def images(self) -> Iterator[bytes]:
-        """Yield the encoded frames."""
-        return map(self._image, range(len(self.capture)))
+            yield decode_pixels(self.image(place), size=(*self.capture.frame_size, 3), where=where)
 
 
 class ImportOptions(TypedDict, total=False):
@@ -260,7 +254,7 @@ def import_recordings(
     Parameters
     ----------
     sources
-        Bags, videos, folders of images, lists of the thesis or data sets of sliplens. In a folder of
+        Bags, videos, folders of images, arrays, tables of stills or data sets of sliplens. In a folder of
         recordings or a manifest (`sliplens.recordings.manifest`) a trial that cannot be imported, or that ended its
         process three times, does not stop the others: `Dataset.left_out` lists it, and `add` tries it again.
     out
@@ -308,7 +302,7 @@ def import_recordings(
     work = _prepare_work(paths, sensor=sensor, reading=reading, labelling=labelling, options=options)
     with reporting(on_progress):
         before = load_dataset(out) if add else None
-        old = () if before is None else before.trials
+        old, left_out = ((), ()) if before is None else (before.trials, before.left_out)
         with open_stage("Opening the recordings"):
             lost = work.open_all()
         names = {info.trial for info in old}
@@ -332,14 +326,8 @@ def import_recordings(
                     _link_trials(before.folder, folder)
                 trials = [(item, job.capture.trial, len(job.capture)) for item, job in jobs.items()]
                 listed = [job.capture for item, job in jobs.items() if work.rows[item[0]].trial]
-                new, failed = write_trials(
-                    work,
-                    trials,
-                    folder,
-                    title="Importing frames",
-                    on=on,
-                    optional={capture.trial: capture.source for capture in listed},
-                )
+                optional = {capture.trial: capture.source for capture in listed}
+                new, failed = write_trials(work, trials, folder, title="Importing frames", on=on, optional=optional)
                 names = {info.trial for info in new}
                 written = [job for job in jobs.values() if job.capture.trial in names]
                 assigned = _assign(old, [job.capture for job in written], plan, last)
@@ -347,7 +335,7 @@ def import_recordings(
                     dataset.save_profile(folder, used)
                 table = [replace(info, split=split) for info, split in zip([*old, *new], assigned.splits, strict=True)]
                 # trials left out before stay listed
-                missing = {trial.trial: trial for trial in (*(before.left_out if before else ()), *lost, *failed)}
+                missing = {trial.trial: trial for trial in (*left_out, *lost, *failed)}
                 missing = [trial for name, trial in missing.items() if name not in {info.trial for info in table}]
                 simulated = all(job.capture.simulated for job in written) and (before is None or before.simulated)
                 dataset.write_dataset_table(folder, table, simulated=simulated, left_out=missing)
@@ -434,9 +422,9 @@ class _ImportWork(TrialWork):
         opened = open_source(
             row.video, reference=image, format=self.format, options=row.reading, sensor=profile, whole=True
         )
+        # a profile names the sensor itself
         facts = {"day": row.day, "object": row.object, "condition": row.condition}
-        facts |= {} if profile else {"sensor": row.sensor}  # a profile names it itself
-        facts |= {"trial": row.trial} if row.trial and len(opened) == 1 else {}
+        facts |= {"sensor": None if profile else row.sensor, "trial": (row.trial or None) if len(opened) == 1 else None}
         facts = {name: fact for name, fact in facts.items() if fact is not None}
         captures = [replace(capture, **facts) for capture in opened]
         if row.trial:
@@ -475,10 +463,9 @@ def _link_trials(source: Path, folder: Path) -> None:
                 with whole_file(Path(target)) as part:
                     shutil.copyfile(file, part)
 
-    for name in ("trials", "forces", "audit"):
+    for name in ("trials", "forces", "audit", SENSORS_FOLDER):
         if (source / name).is_dir():
             shutil.copytree(source / name, folder / name, copy_function=link, dirs_exist_ok=True)
-    dataset.copy_profiles(source, folder)
 
 
 def _require_names(captures: Sequence[Capture], left_out: Sequence[LeftOut] = ()) -> None:

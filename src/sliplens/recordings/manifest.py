@@ -11,11 +11,12 @@ from typing import Any, TypeAlias
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.formats import recognise
+from sliplens.recordings.formats.arrays import SUFFIXES
 from sliplens.recordings.formats.tables import trial_name
 from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.sensor import SensorProfile
 
-_VIDEOS = frozenset({".mp4", ".m4v", ".mkv", ".mov", ".avi", ".webm", ".mpg", ".mpeg"})
+_FILES = SUFFIXES | {".mp4", ".m4v", ".mkv", ".mov", ".avi", ".webm", ".mpg", ".mpeg"}
 _TABLES = frozenset({".csv", ".tsv", ".txt"})
 _FORCE_SUFFIX = re.compile(r"[-_. ](forces?|wrench|ft)$", re.IGNORECASE)
 _LONGEST_NAME = 255  # characters, of a file or a folder
@@ -58,7 +59,7 @@ def pair_recordings(folder: Path) -> tuple[ManifestRow, ...]:
     recordings: dict[Path, str] = {}
     for path in (paths := [path for path in sorted(folder.iterdir()) if not path.name.startswith(".")]):
         bag = path.is_dir() or path.suffix in {".mcap", ".db3"}
-        if path.suffix.lower() in _VIDEOS or (bag and recognise(path) not in {None, "sliplens"}):
+        if path.suffix.lower() in _FILES or (bag and recognise(path) not in {None, "sliplens"}):
             # some systems write an umlaut as two characters
             recordings[path] = unicodedata.normalize("NFC", path.stem if path.is_file() else path.name)
     for path in paths:
@@ -86,15 +87,14 @@ def read_rows(path: Path) -> tuple[ManifestRow, ...]:
     `ReadOptions`, such as `time_unit` or `force_columns` (separated by spaces), sets it for its trial.
     """
     folder = path.parent
-    columns: dict[str, Column] = dict.fromkeys((item.name for item in fields(ManifestRow)), (str, ""))
-    columns |= dict.fromkeys((item.name for item in fields(ReadOptions)), (str, ""))
+    names = [item.name for kind in (ManifestRow, ReadOptions) for item in fields(kind) if item.name != "reading"]
+    columns: dict[str, Column] = dict.fromkeys(names, (str, ""))
     columns |= dict.fromkeys(("day", "skip_frames"), (int, "write a whole number"))
     columns |= dict.fromkeys(("mu", "frame_rate", "start_s"), (float, "write a number with a decimal point"))
     columns |= dict.fromkeys(("video", "forces", "times", "image_root"), (folder.joinpath, ""))
     columns["sensor"] = (lambda text: str(folder / text) if text.endswith(".toml") else text, "")
     columns["reference"] = (lambda text: int(text) if text.isdecimal() else folder / text, "name an image or a frame")
     columns["force_columns"] = (lambda text: tuple(text.split()), "")
-    del columns["reading"]
     rows = []
     for where, cells in read_csv(path, columns, what="a manifest", needed="video"):
         for name, text in cells.items():
@@ -110,8 +110,7 @@ def read_rows(path: Path) -> tuple[ManifestRow, ...]:
 
 
 def _require_unique(rows: tuple[ManifestRow, ...], where: Path) -> tuple[ManifestRow, ...]:
-    repeated = [name for name, count in Counter(row.trial for row in rows).items() if count > 1]
-    if repeated:
+    if repeated := [name for name, count in Counter(row.trial for row in rows).items() if count > 1]:
         raise RecordingError(f"{where} has several trials named {', '.join(repeated)}; give each a name of its own")
     return rows
 
@@ -141,13 +140,14 @@ def read_csv(path: Path, columns: Collection[str], *, what: str, needed: str) ->
                 if len(cells) > len(names):
                     raise RecordingError(f"{where}: {len(cells)} cells but {len(names)} columns; correct the row")
                 filled = {name: cell.strip() for name, cell in zip(names, cells, strict=False) if cell.strip()}
-                if filled and needed not in filled:
+                if not filled:
+                    continue
+                if needed not in filled:
                     raise RecordingError(f"{where}: the column {needed} is empty; write one row a trial and name it")
-                if needed == "trial" and filled and filled["trial"] in seen:
+                if needed == "trial" and filled["trial"] in seen:
                     raise RecordingError(f"{where}: {filled['trial']} has a row already; write one row a trial")
-                if filled:
-                    seen.add(filled[needed])
-                    yield where, filled
+                seen.add(filled[needed])
+                yield where, filled
     except (UnicodeDecodeError, csv.Error, StopIteration) as error:
         raise RecordingError(f"{path} cannot be read as CSV ({error}); export it again as UTF-8") from None
 

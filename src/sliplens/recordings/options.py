@@ -1,22 +1,9 @@
 """Options of reading and labelling recordings: arguments of the library, and of the command line."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
-
-from sliplens.errors import RecordingError
-
-
-def choose_named(
-    path: Path, fitting: Sequence[str], name: str | None, *, likely: Sequence[str], what: str, option: str
-) -> str | None:
-    """Return the topic or feature that an option names, or the only likely one; None where there is none."""
-    keys = likely if name is None else [key for key in fitting if key == name]
-    if len(keys) > 1 or (name and not keys):
-        wanted = f"no {what} {name}" if name else f"{len(keys)} {what}s"
-        raise RecordingError(f"{path} has {wanted} among {', '.join(fitting) or 'none'}; name one with {option}")
-    return next(iter(keys), None)
 
 
 def option_flags(names: Iterable[str]) -> str:
@@ -52,7 +39,7 @@ class ReadOptions:
     wrench_topic: str | None = None
     """Topic of the forces; the only one if not given."""
     image_root: Path | None = None
-    """Folder that now holds the images whose old paths a list of the thesis names."""
+    """Folder that now holds the images whose old paths a table of stills names."""
 
     def given(self) -> tuple[str, ...]:
         """Return the names of the options that are set, of those that a reader must support."""

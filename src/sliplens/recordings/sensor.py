@@ -78,8 +78,8 @@ class SensorProfile:
             return height, width
         wanted_width, wanted_height = self.resize_px
         if abs(wanted_width * height / (wanted_height * width) - 1) > _MOST_STRETCH:
-            made = f"the profile {self.name} makes {width} x {height} pixels to {wanted_width} x {wanted_height}"
-            raise ImageError(f"{made}, which stretches them; crop to the same shape with crop_px in its file")
+            made = f"{width} x {height} to {wanted_width} x {wanted_height} pixels"
+            raise ImageError(f"the profile {self.name} stretches {made}; crop to the same shape with its crop_px")
         return wanted_height, wanted_width
 
     def apply(self, frame: Frame) -> UInt8[np.ndarray, "rows columns 3"]:
@@ -107,8 +107,8 @@ class SensorProfile:
 
     def prepare(self, capture: Capture) -> Capture:
         """Return a recording with prepared frames and reference, and the name of the sensor."""
-        has_reference = capture.reference is not None or capture.reference_index is not None
-        index = capture.reference_index if has_reference else self.reference_frame
+        index = capture.reference_index
+        index = self.reference_frame if index is None and capture.reference is None else index
         if index is not None and not 0 <= index < len(capture):
             frames = f"{capture.source} has {len(capture)} frames but the profile {self.name} takes frame {index}"
             raise InputError(f"{frames} for the untouched sensor; name one that is there with --reference-frame")
@@ -123,8 +123,7 @@ class SensorProfile:
 
     def settings(self, settings: LabelSettings) -> LabelSettings:
         """Return settings with the axis and sign of the profile where the user set none."""
-        axis = self.normal_axis if settings.normal_axis is None else settings.normal_axis
-        sign = self.normal_sign if settings.normal_sign is None else settings.normal_sign
+        axis, sign = settings.normal_axis or self.normal_axis, settings.normal_sign or self.normal_sign
         return replace(settings, normal_axis=axis, normal_sign=sign)
 
     def _box(self, size: tuple[int, int]) -> tuple[int, int, int, int]:
@@ -162,8 +161,9 @@ def load_profile(profile: Path | str | SensorProfile) -> SensorProfile:
     if not path.exists() and str(profile) in shipped_profiles():
         path = _SHIPPED / f"{profile}.toml"
     if not path.is_file():
-        there = ", ".join(shipped_profiles())
-        raise InputError(f"there is no sensor profile {profile}; name the file of `sensor new`, or one of {there}")
+        raise InputError(
+            f"there is no sensor profile {profile}; name a file, or one of {', '.join(shipped_profiles())}"
+        )
     require_file(path, most=MOST_TEXT)
     try:
         # Windows editors put a mark before the text that TOML does not know

@@ -10,11 +10,9 @@ from typing import TypeAlias, TypedDict, TypeVar, Unpack
 import numpy as np
 from jaxtyping import UInt8
 
-from sliplens.codec import ARRAY_DAMAGE
 from sliplens.errors import ImageError, InputError, RecordingError
 from sliplens.files import hash_file, hash_json, hash_tree
-from sliplens.images import IMAGE_SUFFIXES, Images, as_frames, read_image, require_rgb
-from sliplens.progress import number_of
+from sliplens.images import Images, as_frames, is_image, read_image, require_rgb
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import DATASET_FILE, Dataset, load_dataset
 from sliplens.recordings.formats import open_captures
@@ -56,8 +54,8 @@ def open_source(
     Parameters
     ----------
     source
-        Data set, folder of images, recording, one image, an array in a file (NPY or NPZ), or uint8 frames in memory as
-        `sliplens.images.as_frames` takes them.
+        Data set, folder of images, recording, one image, or uint8 frames in memory as `sliplens.images.as_frames` takes
+        them.
     reference, reference_frame
         Untouched sensor: an image, or the number of the frame that shows it. If neither, that of the source.
     split, trial
@@ -86,15 +84,10 @@ def open_source(
     profile = None if sensor is None else load_profile(sensor)
     opened = _open_dataset(source, format)
     if isinstance(opened, Dataset):
-        if reference is not None or reference_frame is not None:
-            raise InputError(f"the trials of {opened.folder} bring their reference frames; leave out --reference")
-        if names := options.given():
-            raise InputError(f"{opened.folder} is a data set of sliplens, which does not take {option_flags(names)}")
-        if profile is not None:
-            raise InputError(f"{opened.folder} is a data set, which went through its profile; leave out --sensor")
-        infos = opened.select(split=split)
-        places = _choose_trial([info.trial for info in infos], trial, str(opened.folder))
-        return tuple(opened.open(infos[place], samples=whole) for place in places)
+        facts = {"reference": reference, "reference_frame": reference_frame, "sensor": sensor, **vars(options)}
+        if flags := option_flags(name for name, fact in facts.items() if fact is not None):
+            raise InputError(f"the trials of {opened.folder} bring their reference frames and facts; leave out {flags}")
+        return tuple(opened.open(info, samples=whole) for info in opened.select(split=split, trial=trial))
     name = str(opened) if isinstance(opened, Path) else Capture.opened
     if split is not None:
         raise InputError(f"{name} is no data set of sliplens and has no splits; leave out --split")
@@ -103,7 +96,9 @@ def open_source(
     read = _read_captures(opened, format, options, whole=whole)
     captures = [replace(_with_reference(each, reference, reference_frame), opened=name) for each in read]
     captures = captures if profile is None else [profile.prepare(capture) for capture in captures]
-    return tuple(captures[place] for place in _choose_trial([capture.trial for capture in captures], trial, name))
+    if trial is not None and all(capture.trial != trial for capture in captures):
+        raise InputError(f"{name} has no trial {trial}; choose one such as {captures[0].trial}")
+    return tuple(capture for capture in captures if trial in {None, capture.trial})
 
 
 def _open_dataset(source: Path | str | Other, format: str | None) -> Path | Dataset | Other:
@@ -176,8 +171,7 @@ class Trials:
                 require_rgb(frame, what=f"levels of frame {number} of {capture.source}")
                 yield number, frame
             if number + 1 < first + count:
-                ends = f"ends after {number + 1} of its {first + count} frames"
-                raise RecordingError(f"{capture.source} {ends}; make or copy it again")
+                raise RecordingError(f"{capture.source} ends after {number + 1} frames; make or copy it again")
             following[capture.trial, first + count] = frames
 
         def read(trial: str, first: int, count: int) -> tuple[Capture, Iterator[tuple[int, Frame]]]:
@@ -201,10 +195,9 @@ def open_trials(
     source = _open_dataset(source, options.get("format"))
     if isinstance(source, Dataset):
         trial = options.pop("trial", None)
-        infos = [info for info in source.select(split=options.get("split")) if trial in {None, info.trial}]
+        infos = source.select(split=options.get("split"), trial=trial)
         first = {(info.sensor, info.height, info.width): info.trial for info in reversed(infos)}
-        names = list(reversed(first.values())) or [trial]
-        kinds = tuple(open_source(source, **{**options, "trial": name})[0] for name in names)
+        kinds = tuple(open_source(source, **{**options, "trial": name})[0] for name in reversed(first.values()))
         rows = tuple((info.trial, info.frames, info.sha256) for info in infos)
         return Trials(source=source, options=options, kinds=kinds, rows=rows)
     if on != "serial" and not isinstance(source, Path):
@@ -229,17 +222,14 @@ def _read_captures(
 ) -> Sequence[Capture]:
     name, where, what, files, rate = "frames", Capture.opened, "frames", None, options.frame_rate
     if isinstance(source, Path):
-        is_array = source.suffix.lower() in _ARRAYS
-        single = is_array or source.suffix.lower() in IMAGE_SUFFIXES
-        if whole or format is not None or not single or not source.is_file():
+        if whole or format is not None or not is_image(source):
             captures = open_captures(source, format=format, options=options)
             # unlike on import, the times of images may stay unknown
             if whole and any(capture.time_s is None for capture in captures):
                 raise RecordingError(f"the frames of {source} have no times; give --times or --frame-rate")
             return captures
-        name, where, what = trial_name(source.stem), str(source), f"frames of {source}"
-        files = None if is_array else (source.name,)
-        source = _load_array(source) if is_array else read_image(source)
+        name, where, what, files = trial_name(source.stem), str(source), f"frames of {source}", (source.name,)
+        source = read_image(source)
     frames = as_frames(source, what=what)
     if not len(frames):
         raise InputError("there is no frame; give one or more")
@@ -248,34 +238,6 @@ def _read_captures(
     time_s = np.full(len(frames), np.nan) if rate is None else evenly_spaced(len(frames), frame_rate=rate)
     read, size = frames.__iter__, frames.shape[1:3]
     return [Capture(trial=name, source=where, frame_time_s=time_s, frame_size=size, read_frames=read, files=files)]
-
-
-_ARRAYS = frozenset({".npy", ".npz"})
-
-
-def _load_array(path: Path) -> np.ndarray:
-    """Read the frames of a NumPy file: its only array, or the one named frames or images; no pickle is opened."""
-    try:
-        if path.suffix.lower() == ".npy":
-            return np.load(path, mmap_mode="r", allow_pickle=False)
-        # a stream of ours: NumPy leaves its own open where an archive is damaged
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-            names = [name for name in stored.files if name in {"frames", "images"} or len(stored.files) == 1]
-            if len(names) == 1:
-                return stored[names[0]]
-            count = len(stored.files)
-    except ARRAY_DAMAGE as error:
-        raise RecordingError(f"{path} cannot be read as a NumPy array ({error}); save it again") from None
-    raise RecordingError(f"{path} holds {number_of(count, 'array')}; name that of the frames 'frames'")
-
-
-def _choose_trial(names: Sequence[str], trial: str | None, source: str) -> Sequence[int]:
-    """Return the place of a trial, or of all if None."""
-    if trial is None:
-        return range(len(names))
-    if trial not in names:
-        raise InputError(f"{source} has no trial {trial}; choose one such as {names[0]}")
-    return [names.index(trial)]
 
 
 def _with_reference(trial: Capture, image: Path | str | Images | None, number: int | None) -> Capture:
@@ -294,7 +256,8 @@ def _with_reference(trial: Capture, image: Path | str | Images | None, number: i
         raise ImageError(f"the reference is {len(frames)} images; give one of the untouched sensor")
     (pixels,) = frames
     if pixels.shape[:2] != trial.frame_size:
-        height, width = trial.frame_size
-        sizes = f"{pixels.shape[0]} x {pixels.shape[1]} pixels but the frames of {trial.trial} are {height} x {width}"
-        raise ImageError(f"the reference is {sizes}; record both with the same camera settings")
+        sizes = [" x ".join(map(str, size)) for size in (pixels.shape[:2], trial.frame_size)]
+        raise ImageError(
+            f"the reference is {sizes[0]} pixels but the frames of {trial.trial} are {sizes[1]}; record both alike"
+        )
     return replace(trial, reference=pixels)

@@ -19,7 +19,6 @@ from sliplens.recordings.trial import TrialFacts
 
 SPLITS = ("train", "validation", "test")  #: Splits that trials are assigned to.
 Group: TypeAlias = Literal["trial", "object", "day"]  #: Facts by which trials are grouped.
-_SPLIT_NAME = re.compile(r"[a-z][a-z0-9_-]*")
 # shares are written with few digits: thirds as 0.3333 should be corrected by whoever wrote them
 _SUM_TOLERANCE = 1e-6
 _MOST_NAMES = 5  # names in a message before the rest is counted
@@ -36,12 +35,11 @@ class SplitResult(Result):
 
 def read_split_table(path: Path) -> dict[str, str]:
     """Read a table (CSV) with the columns `trial` and `split`."""
-    cure = "name trial, object or day, or write a table with the columns trial and split (CSV)"
-    require_file(path, missing=cure, most=MOST_TEXT)
+    require_file(path, missing="name trial, object or day, or write a table: trial,split (CSV)", most=MOST_TEXT)
     table: dict[str, str] = {}
     for where, cells in read_csv(path, ("trial", "split"), what="a table of splits", needed="trial"):
         trial, split = cells["trial"], cells.get("split", "")
-        if not _SPLIT_NAME.fullmatch(split):
+        if not re.fullmatch(r"[a-z][a-z0-9_-]*", split):
             raise RecordingError(f"{where}: split is {split!r}; use a lower-case word such as train or test")
         table[trial] = split
     if not table:
@@ -180,7 +178,6 @@ def _remarks(trials: Sequence[TrialFacts], splits: Sequence[str]) -> list[str]:
 
 def _list(names: Sequence[str]) -> str:
     """Join names, the first few and the number of the others."""
-    rest = len(names) - _MOST_NAMES
-    if rest > 1:
+    if (rest := len(names) - _MOST_NAMES) > 1:
         return f"{', '.join(names[:_MOST_NAMES])} and {rest} more"
     return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))

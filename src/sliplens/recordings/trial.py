@@ -76,12 +76,11 @@ class Labels:
     def _require_consistent(self, count: int, where: str) -> None:
         """Check that there is one value a frame, each in its range."""
         for name in (*SIGNALS, "contact_state", *OPTIONAL_LABELS):
-            if (values := getattr(self, name, None)) is None:
-                continue
-            if len(values) != count:
+            values = getattr(self, name, None)
+            if values is not None and len(values) != count:
                 begin = f"trial {where} has" if where else "there are"
                 raise RecordingError(f"{begin} {len(values)} values of {name} for {count} frames; give one a frame")
-            if name in LABEL_BOUNDS:
+            if values is not None and name in LABEL_BOUNDS:
                 require_possible(values, name=name, where=where)
 
     @property

@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 import torch
 from torch import nn
 
-from sliplens.codec import load_result, save_record
+from sliplens.codec import load_result, write_json
 from sliplens.errors import InputError
 from sliplens.explainers.contract import Explainer
 from sliplens.explainers.explain import with_markers
@@ -139,7 +139,7 @@ def run_study(
         of_networks = [replace(records, network=name) for name in records.networks]
         for step in SHARED:
             _run_step(step, records)
-        save_record(config, records.folder / CONFIG_FILE)
+        write_json(records.folder / CONFIG_FILE, config)
         steps = [step for step in _required_steps(config.tests) if step not in SHARED]
         if records.not_redrawn and "truth" in steps:
             steps.remove("truth")

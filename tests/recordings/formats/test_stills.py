@@ -1,4 +1,4 @@
-"""Tables of labelled stills: every image meets the forces of its row, whatever the table calls its columns."""
+"""Tables of labelled stills, and the lists of the thesis: every image meets the forces or the margin of its row."""
 
 from pathlib import Path
 
@@ -103,3 +103,98 @@ def test_numbers_of_frames_are_no_files(tmp_path: Path, frames: np.ndarray):
     assert recognise(folder / "pictures") == "images"
     options = ReadOptions(forces=forces, frame_rate=10.0)
     np.testing.assert_allclose(there(open_source(folder / "pictures", options=options)[0].forces).force_n[:, 2], 1)
+
+
+LISTS = ("set_images_L.txt", "set_images_Lref.txt", "set_gamma.csv")
+PATHS = [f"trial{trial}/L/image_{number}.png" for trial in (77, 83) for number in (9, 10, 51)]
+REFERENCES = [f"trial{trial}/L/image_0.png" for trial in (77, 83) for _ in range(3)]
+MARGINS = ["1.0", "0.6", "0.2", "0.9", "0.5", "0.1"]
+
+
+@pytest.fixture
+def images(tmp_path: Path, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Two trials of frames and their references, by their paths under the folder `data`."""
+    images = {}
+    for name in (*PATHS, *REFERENCES[::3]):
+        (path := tmp_path / "data" / name).parent.mkdir(parents=True, exist_ok=True)
+        images[name] = rng.integers(0, 256, (16, 16, 3), dtype=np.uint8)
+        write_png(path, images[name])
+    return images
+
+
+def write_lists(folder: Path, paths: list[str], references: list[str], margins: list[str]) -> Path:
+    for name, lines in zip(LISTS, (paths, references, margins), strict=True):
+        (folder / name).write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def require_trials(source: Path, images: dict[str, np.ndarray], *names: str, **options: object) -> None:
+    """Check the frames, references and margins of both trials."""
+    trials = open_source(source, options=ReadOptions(**options))  # pyright: ignore[reportArgumentType]
+    assert [trial.trial for trial in trials] == list(names)
+    for place, trial in enumerate(trials):
+        at = slice(3 * place, 3 * place + 3)
+        np.testing.assert_array_equal(list(trial.read_frames()), [images[name] for name in PATHS[at]])
+        np.testing.assert_array_equal(there(trial.reference), images[REFERENCES[at][0]])
+        np.testing.assert_allclose(there(trial.safety_margin), [float(margin) for margin in MARGINS[at]])
+
+
+@pytest.mark.parametrize("order", [range(6), [2, 3, 0, 5, 4, 1]], ids=["in order", "shuffled"])
+@pytest.mark.parametrize("percent", [False, True])
+def test_the_lists_of_the_thesis_give_a_trial_for_each_reference(
+    tmp_path: Path, images: dict[str, np.ndarray], order: list[int], percent: bool
+):
+    margins = [f"{100 * float(margin):g}" for margin in MARGINS] if percent else MARGINS
+    paths, references, margins = ([values[at] for at in order] for values in (PATHS, REFERENCES, margins))
+    write_lists(tmp_path / "data", paths, references, ["gamma", *margins] if percent else margins)
+    assert recognise(tmp_path / "data") == "stills"
+    require_trials(tmp_path / "data", images, "set-1", "set-2")
+
+
+@pytest.mark.parametrize("prefix", ["/home/training-pc/Data/", "C:\\Users\\max\\Data\\", "./", "november/"])
+def test_paths_of_another_computer_are_found_under_the_root(tmp_path: Path, images: dict[str, np.ndarray], prefix: str):
+    moved = [[prefix + name.replace("/", prefix[-1]) for name in names] for names in (PATHS, REFERENCES)]
+    (tmp_path / "lists").mkdir()
+    lists = write_lists(tmp_path / "lists", moved[0], moved[1], MARGINS)
+    require_trials(lists / LISTS[0], images, "set-1", "set-2", image_root=tmp_path / "data")
+
+
+def test_a_table_of_margins_gives_what_the_lists_give(tmp_path: Path, images: dict[str, np.ndarray]):
+    rows = zip(PATHS, REFERENCES, MARGINS, strict=True)
+    path = tmp_path / "data" / "states.csv"
+    path.write_text("file,reference,safety_margin\n" + "".join(",".join(row) + "\n" for row in rows))
+    require_trials(path, images, "data-1", "data-2", frame_rate=30.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({1: REFERENCES[:2]}, r"L\.txt has 6 frames, .* 2 references and set_gamma\.csv 6 margins; give as many"),
+        ({2: ["gamma"]}, r"gamma\.csv 1 margins"),
+        ({2: ["much", *MARGINS[1:]]}, "entry 1, 'safety_margin' is 'much', not a finite number"),
+        ({2: ["1.2", *MARGINS[1:]]}, r"safety_margin of frame 0 is 1\.2, outside \[0, 1\]"),
+        ({2: ["150", *MARGINS[1:]]}, r"safety_margin of frame 0 is 1\.5, outside"),
+        ({2: ["nan"] * 6}, "holds no safety margin"),
+        ({0: [*PATHS[:5], "trial77/L/image_7.png"]}, "entry 6: .* is not there, nor under"),
+        ({0: [PATHS[0], *PATHS[:5]]}, "entry 2 names .* again"),
+        ({0: [*PATHS[:5], "../../etc/passwd"]}, "entry 6: .* leads out of"),
+        ({0: [*PATHS[:5], "x" * 5000]}, "entry 6: .* is not there"),
+        ({0: ["\0\xff"] * 6}, "is not a text file"),
+    ],
+)
+def test_lists_that_do_not_fit_are_refused(
+    tmp_path: Path, images: dict[str, np.ndarray], change: dict[int, list[str]], message: str
+):
+    paths, references, margins = (change.get(at, lines) for at, lines in enumerate((PATHS, REFERENCES, MARGINS)))
+    write_lists(tmp_path / "data", paths, references, margins)
+    with pytest.raises(InputError, match=message):
+        open_source(tmp_path / "data" / LISTS[0])
+
+
+def test_lists_that_are_missing_or_too_many_are_refused(tmp_path: Path, images: dict[str, np.ndarray]):
+    lists = write_lists(tmp_path / "data", PATHS, REFERENCES, MARGINS)
+    (lists / LISTS[1]).rename(lists / "test_images_L.txt")
+    with pytest.raises(InputError, match="no table of stills, or more than one; name the table itself"):
+        open_source(lists, format="stills")
+    with pytest.raises(InputError, match=r"Lref\.txt does not exist"):
+        open_source(lists / LISTS[0])

@@ -13,9 +13,9 @@ from sliplens.extras import Table
 from sliplens.images import IMAGE_SUFFIXES
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import DATASET_FILE, load_dataset
+from sliplens.recordings.formats import arrays
 from sliplens.recordings.formats.images import find_states, read_image_folder, read_stills
 from sliplens.recordings.formats.rosbag import read_rosbag
-from sliplens.recordings.formats.thesis import is_thesis_list, read_thesis
 from sliplens.recordings.formats.video import read_video
 from sliplens.recordings.options import ReadOptions, option_flags
 
@@ -46,17 +46,17 @@ _ROWS = {
         takes=("image_topic", "wrench_topic"),
         read=read_rosbag,
     ),
-    "thesis": Reader(
-        words="lists of the thesis (*_images_L.txt), with their margins",
-        recognises=is_thesis_list,
-        takes=("image_root", "frame_rate"),
-        read=read_thesis,
-    ),
     "stills": Reader(
-        words="table of labelled stills: a column of files, and forces",
+        words="table of labelled stills: a column of files, and forces or margins",
         recognises=lambda path: find_states(path) is not None,
-        takes=("image_root", "force_columns", "force_unit"),
+        takes=("image_root", "frame_rate", "force_columns", "force_unit"),
         read=read_stills,
+    ),
+    "arrays": Reader(
+        words="arrays of frames, with or without forces (NPZ, NPY, HDF5)",
+        recognises=lambda path: path.suffix.lower() in arrays.SUFFIXES and path.is_file(),
+        takes=_FORCE_TABLE,
+        read=arrays.read_arrays,
     ),
     "images": Reader(
         words="folder of images, with a table of forces",

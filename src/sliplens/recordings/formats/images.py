@@ -1,4 +1,4 @@
-"""Images in files: a folder as one trial, and stills under known forces, listed in a table, a row an image."""
+"""Images in files: a folder as one trial, a table of stills under known forces, and the lists of the thesis."""
 
 import os
 from collections.abc import Sequence
@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Float
 
 from sliplens.errors import RecordingError
-from sliplens.images import image_size, list_images, read_image
+from sliplens.images import image_size, list_images, natural_key, read_image
 from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.formats import tables
 from sliplens.recordings.options import ReadOptions
-from sliplens.recordings.trial import ContactState, labels_of_margins
+from sliplens.recordings.trial import ContactState, labels_of_margins, require_possible
 
 
 def common_size(paths: tuple[Path, ...]) -> tuple[int, int]:
@@ -23,8 +23,8 @@ def common_size(paths: tuple[Path, ...]) -> tuple[int, int]:
     first = image_size(paths[0])
     for path in paths[1:]:
         if (size := image_size(path)) != first:
-            sizes = f"{path} is {size[1]} x {size[0]} pixels but {paths[0].name} is {first[1]} x {first[0]}"
-            raise RecordingError(f"{sizes}; record all frames of a trial with the same camera settings")
+            sizes = f"{size[1]} x {size[0]} pixels but {paths[0].name} is {first[1]} x {first[0]}"
+            raise RecordingError(f"{path} is {sizes}; record all frames with the same camera settings")
     return first
 
 
@@ -33,9 +33,8 @@ _NAME_COLUMNS = ("file", "filename", "file_name", "image", "image_name", "frame"
 
 def find_name_column(table: tables.TextTable) -> str:
     """Find the column that holds names of images by its name."""
-    for name in table.header:
-        if name.lower().replace(" ", "_") in _NAME_COLUMNS:
-            return name
+    if names := [name for name in table.header if name.lower().replace(" ", "_") in _NAME_COLUMNS]:
+        return names[0]
     columns = ", ".join(map(repr, table.header))
     raise RecordingError(f"{table.path} has no column with the names of images among {columns}; call it file")
 
@@ -53,7 +52,7 @@ def read_frame_times(
         name = PureWindowsPath(cells[name_at]).name  # divides at slashes and backslashes
         if name in stamps:
             raise RecordingError(f"{path}, line {line} names {name!r} again; give each image one time")
-        stamps[name] = tables.to_number(cells[time_at], path=path, line=line, column=time_column), line
+        stamps[name] = tables.to_number(cells[time_at], table=table, line=line, column=time_column), line
     rows = len(stamps)
     # "frame_1.5" has no ending: a full name is looked up before one without it
     for name in list(stamps):
@@ -62,7 +61,7 @@ def read_frame_times(
         raise RecordingError(f"{path} has no time for {absent[0]}; add a row for every image of the folder")
     timed = sorted((*(stamps.get(image.name) or stamps[image.stem]), image) for image in images)
     stamp, lines, ordered = zip(*timed, strict=True)
-    time_s, unit = tables.scale_times(np.array(stamp), lines, path=path, column=time_column)
+    time_s, unit = tables.scale_times(np.array(stamp), lines, table=table, column=time_column)
     times = f"{path.name}: times of images are those of column {time_column!r}, in {unit}"
     notes = [f"{times}, their names those of {name_column!r}."]
     if rows > len(images):
@@ -130,19 +129,24 @@ def _is_file(path: Path) -> bool:
 
 _SUFFIXES = frozenset({".csv", ".tsv", ".txt"})
 _LEAST_FORCE_N = 1e-9  #: Forces below it are none: the sensor is untouched.
+_LISTS = ("_images_L.txt", "_images_Lref.txt", "_gamma.csv")  # of the thesis: frames, reference frames, margins
+_MARGIN = "safety_margin"
 
 
 def find_states(path: Path) -> Path | None:
-    """Find the table of stills that a path is, or the only one in a folder: a column of files, forces beside it.
+    """Find the table of stills that a path is, or the only one in a folder: a column of files, labels beside it.
 
-    Its first row names an image that exists; a number of a frame is no file.
+    Its first row names an image that exists; a number of a frame is no file. Lists of the thesis are known by name.
     """
-    states = []
-    for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    if states := [file for file in files if file.name.endswith(_LISTS[0])]:
+        return states[0] if len(states) == 1 else None
+    for file in files:
         with suppress(RecordingError, OSError, StopIteration):
             if file.suffix.lower() in _SUFFIXES and file.is_file():
                 table = tables.open_text_table(file)
-                tables.choose_force_columns(table, ReadOptions())
+                if _MARGIN not in table.header:
+                    tables.choose_force_columns(table, ReadOptions())
                 _, cells = next(table.rows)
                 listed = cells[table.header.index(find_name_column(table))]
                 find_image(listed, str(file), folder=file.parent, root=file.parent)
@@ -150,58 +154,97 @@ def find_states(path: Path) -> Path | None:
     return states[0] if len(states) == 1 else None
 
 
-def read_stills(path: Path, options: ReadOptions) -> Capture:
-    """Open the images that a table lists, in its order, each with its forces.
+def _join_lists(path: Path) -> tables.TextTable:
+    """Join the three lists of a set of the thesis, as its programs read them (`get_data` in polycam-regression)."""
+    files = [path.with_name(path.name.removesuffix(_LISTS[0]) + ending) for ending in _LISTS]
+    images, references, margins = ([text.strip() for _, text in tables.text_lines(file)] for file in files)
+    if len(margins) == len(images) + 1:
+        del margins[0]  # a header
+    if not len(images) == len(references) == len(margins):
+        counts = f"{len(references)} references and {files[2].name} {len(margins)} margins"
+        raise RecordingError(f"{path} has {len(images)} frames, {files[1].name} {counts}; give as many")
+    rows = enumerate(map(list, zip(images, references, margins, strict=True)), start=1)
+    return tables.TextTable(path=path, header=("file", "reference", _MARGIN), rows=rows, row="entry")
 
-    Stills have no times: they count as one a second. The margin is unknown unless `LabelSettings.mu` gives the
-    friction. The forces of columns such as `shear_x_n`, `shear_y_n`, `normal_n` become x, y and z, those of `fn`, `ft`
-    become z and x; the first image without any force shows the untouched sensor.
+
+def read_stills(path: Path, options: ReadOptions) -> list[Capture]:
+    """Open the images that a table lists, in its order, each with its forces or its safety margin.
+
+    Stills count as one a second unless a rate is declared. The forces of columns such as `shear_x_n`, `shear_y_n`,
+    `normal_n` become x, y and z, those of `fn`, `ft` become z and x; margins then need `LabelSettings.mu`, and the
+    first image without any force shows the untouched sensor. A column `safety_margin` has fractions, or percents where
+    one is larger than 2. Each image in a column `reference` makes a trial of the frames beside it.
     """
-    states = path if path.is_file() else find_states(path)
-    if states is None:
+    states = find_states(path) or path
+    if states.is_dir():
         raise RecordingError(f"{path} has no table of stills, or more than one; name the table itself")
-    table = tables.open_text_table(states)
-    name_column = find_name_column(table)
-    names, how = tables.choose_force_columns(table, options)
-    rows = list(table.rows)
-    numbers, lines, notes = tables.read_numbers(replace(table, rows=iter(rows)), names)
-    force_n, (axes, unit) = tables.scale_forces(numbers, lines, names, options, path=states)
-    root = options.image_root or states.parent
-    place, lines_of = table.header.index(name_column), dict[Path, int]()
-    for line, cells in rows:
-        image = find_image(cells[place], f"{states}, line {line}", folder=states.parent, root=root)
-        if image in lines_of:
-            again = f"{states}, line {line} names {cells[place]!r} again, as line {lines_of[image]}"
-            raise RecordingError(f"{again}; drop one")
-        lines_of[image] = line
-    images = tuple(lines_of)
-    size = common_size(images)
-    time_s = np.arange(float(len(images)))
-    normal_n, tangential_n = force_n[:, 2], np.hypot(force_n[:, 0], force_n[:, 1])
-    if (normal_n < 0).any():
-        where = f"{states}, line {lines[int(np.argmax(normal_n < 0))]}"
-        raise RecordingError(f"{where}: the normal force is {normal_n.min():.4g} N; give it positive where it presses")
-    untouched = np.flatnonzero(np.abs(force_n).max(axis=1) < _LEAST_FORCE_N)
-    labels = labels_of_margins(np.full(len(images), np.nan))
-    unknown = (ContactState.NO_CONTACT if at in untouched else ContactState.UNKNOWN for at in range(len(images)))
-    return Capture(
-        trial=tables.trial_name(states.resolve().parent.name),
-        source=str(states),
-        frame_time_s=time_s,
-        frame_size=size,
-        read_frames=partial(map, partial(read_image, size=size), images),
-        forces=Forces(time_s=time_s, force_n=force_n, source=str(states)),
-        notes=(
-            f"{states.name}: forces are those of {', '.join(map(repr, names))} as {axes} ({how}), {unit}.",
-            f"{states.name}: stills have no times; they count as one a second. Margins need a friction (--mu).",
-            *notes,
-        ),
-        labels=replace(
-            labels,
-            normal_force_n=normal_n,
-            tangential_force_n=tangential_n,
-            contact_state=tuple(unknown),
-        ),
-        reference_index=int(untouched[0]) if len(untouched) else None,
-        files=tuple(image.name for image in images),
+    lists = states.name.endswith(_LISTS[0])
+    table = _join_lists(states) if lists else tables.open_text_table(states)
+    rows, rate = list(table.rows), options.frame_rate or 1.0
+    table, name_column = replace(table, rows=iter(rows)), find_name_column(table)
+    notes: tuple[str, ...] = (
+        f"{states.name}: stills have no times; they count as {f'{rate:g}' if rate != 1 else 'one'} a second.",
     )
+    if _MARGIN in table.header:
+        values, lines, more = tables.read_numbers(table, (_MARGIN,))
+        # no margin as a fraction comes near 2, percents all do
+        percent = bool((values > 2).any())
+        margin, force_n = values[:, 0] / (100 if percent else 1), None
+        if np.isnan(margin).all():
+            raise RecordingError(f"{states} holds no safety margin; give one a line")
+        require_possible(margin, name="safety_margin", where=states.name)
+        notes += (f"{states.name}: margins were read as {'percent' if percent else 'fractions'}, by their size.", *more)
+    else:
+        names, how = tables.choose_force_columns(table, options)
+        numbers, lines, more = tables.read_numbers(table, names)
+        force_n, (axes, unit) = tables.scale_forces(numbers, lines, names, options, table=table)
+        if (force_n[:, 2] < 0).any():
+            where, least = table.place(lines[int(np.argmax(force_n[:, 2] < 0))]), force_n[:, 2].min()
+            raise RecordingError(f"{where}: the normal force is {least:.4g} N; give it positive where it presses")
+        margin = np.full(len(rows), np.nan)
+        columns = f"{', '.join(map(repr, names))} as {axes} ({how}), {unit}."
+        notes = (f"{states.name}: forces are those of {columns}", f"{notes[0]} Margins need a friction (--mu).", *more)
+    find = partial(find_image, folder=states.parent, root=options.image_root or states.parent)
+    trials: dict[Path | None, dict[Path, int]] = {}
+    for number, (line, cells) in enumerate(rows):
+        row, where = dict(zip(table.header, cells, strict=True)), table.place(line)
+        reference = find(row["reference"], where) if "reference" in row else None
+        places, image = trials.setdefault(reference, {}), find(row[name_column], where)
+        if image in places:
+            raise RecordingError(f"{where} names {row[name_column]!r} again, as line {lines[places[image]]}; drop one")
+        places[image] = number
+    base = tables.trial_name(states.name.removesuffix(_LISTS[0]) if lists else states.resolve().parent.name)
+    captures = []
+    for number, (reference, places) in enumerate(trials.items(), start=1):
+        # shuffled frames of a list come in the natural order of their names
+        images = tuple(sorted(places, key=lambda image: natural_key(str(image))) if lists else places)
+        at = [places[image] for image in images]
+        size = common_size(images if reference is None else (reference, *images))
+        time_s, labels = tables.evenly_spaced(len(images), frame_rate=rate), labels_of_margins(margin[at])
+        forces, untouched = None, None
+        if force_n is not None:
+            forces = Forces(time_s=time_s, force_n=force_n[at], source=str(states))
+            touched = np.abs(forces.force_n).max(axis=1) >= _LEAST_FORCE_N
+            untouched = None if touched.all() else int(np.argmin(touched))
+            labels = replace(
+                labels,
+                normal_force_n=forces.force_n[:, 2],
+                tangential_force_n=np.hypot(forces.force_n[:, 0], forces.force_n[:, 1]),
+                contact_state=tuple(ContactState.UNKNOWN if each else ContactState.NO_CONTACT for each in touched),
+            )
+        captures.append(
+            Capture(
+                trial=base if len(trials) == 1 else f"{base}-{number:0{len(str(len(trials)))}d}",
+                source=str(states),
+                frame_time_s=time_s,
+                frame_size=size,
+                read_frames=partial(map, partial(read_image, size=size), images),
+                forces=forces,
+                notes=notes,
+                labels=labels,
+                reference=None if reference is None else read_image(reference, size=size),
+                reference_index=untouched,
+                files=tuple(image.name for image in images),
+            )
+        )
+    return captures

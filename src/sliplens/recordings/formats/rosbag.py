@@ -16,7 +16,7 @@ from sliplens.files import require_file
 from sliplens.images import image_size, read_image
 from sliplens.recordings.capture import Capture, Forces, Frame
 from sliplens.recordings.formats.tables import trial_name
-from sliplens.recordings.options import ReadOptions, choose_named
+from sliplens.recordings.options import ReadOptions
 
 if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader
@@ -46,12 +46,8 @@ def _message_size(message: Any, *, where: str) -> tuple[int, int]:
     channels, _ = _ENCODINGS[message.encoding]
     height, width, step = message.height, message.width, message.step
     # nothing has the claimed size until it is known to be there
-    if (
-        min(height, width) == 0
-        or step < width * channels
-        or height * step > len(message.data)
-        or (channels == 2 and width % 2)
-    ):
+    fits = step >= width * channels and height * step <= len(message.data) and not (channels == 2 and width % 2)
+    if not (height and width and fits):
         claims = f"claims {height} rows of {step} bytes for {width} pixels of {message.encoding}"
         raise RecordingError(f"{where} {claims} but holds {len(message.data)} bytes; mend it or record it again")
     return height, width
@@ -102,30 +98,36 @@ def open_bag(path: Path) -> Iterator["Reader"]:
         raise RecordingError(f"{path} is not a readable ROS 2 bag ({text}); try `mcap recover`") from None
 
 
+def _choose_topic(path: Path, topics: Mapping[str, str], name: str | None, *, what: str) -> str | None:
+    """Return the topic that an option names, or the only one of its kind; None where there is none."""
+    fitting = [topic for topic, kind in topics.items() if kind in _TYPES[what]]
+    chosen = [topic for topic in fitting if name in {None, topic}]
+    if len(chosen) > 1 or (name and not chosen):
+        wanted = f"no {what} topic {name}" if name else f"{len(chosen)} {what} topics"
+        raise RecordingError(f"{path} has {wanted} among {', '.join(fitting) or 'none'}; name one with --{what}-topic")
+    return next(iter(chosen), None)
+
+
 def read_rosbag(path: Path, options: ReadOptions) -> Capture:
     """Read a bag as one trial.
 
-    A first pass reads stamps and sizes; pixels are decoded when frames are read. Frames
-    and forces share one clock, that of the message headers; where a header has no stamp, or the two topics have clocks
-    that never meet, both take the times at which the bag received them, and `notes` say so.
+    A first pass reads stamps and sizes; pixels are decoded when frames are read. Frames and forces share the clock of
+    the message headers; where a header has no stamp, or the two topics have clocks that never meet, both take the
+    times at which the bag received them, and `notes` say so.
     Times are seconds since the first frame or force: since the epoch, double precision would round them to 0.2 us.
     """
     notes, size = [], None
     with open_bag(path) as bag:
         topics = {connection.topic: connection.msgtype for connection in bag.connections}
-    images, wrenches = (
-        choose_named(path, fitting, name, likely=fitting, what=f"{what} topic", option=f"--{what}-topic")
-        for what, name in (("image", options.image_topic), ("wrench", options.wrench_topic))
-        for fitting in [[topic for topic, kind in topics.items() if kind in _TYPES[what]]]
-    )
+    images = _choose_topic(path, topics, options.image_topic, what="image")
+    wrenches = _choose_topic(path, topics, options.wrench_topic, what="wrench")
     if images is None:
         listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items())) or "no topic"
         raise RecordingError(f"{path} has no topic with images; record the camera too (it has {listed})")
-    chosen = [images] if wrenches is None else [images, wrenches]
+    chosen = {name: topics[name] for name in (images, wrenches) if name is not None}
     # an hour at 1 kHz is 100 MB
-    stamps_ns = {name: {clock: array("q") for clock in _CLOCKS} for name in chosen}
-    forces_n = array("d")
-    for name, bag_ns, message in bag_messages(path, {name: topics[name] for name in chosen}):
+    stamps_ns, forces_n = {name: {clock: array("q") for clock in _CLOCKS} for name in chosen}, array("d")
+    for name, bag_ns, message in bag_messages(path, chosen):
         if name == images:
             where = f"frame {len(stamps_ns[name]['bag'])} of {images} in {path}"
             before, size = size, _message_size(message, where=where)
@@ -145,10 +147,8 @@ def read_rosbag(path: Path, options: ReadOptions) -> Capture:
     clock, why = _choose_clock({name: stamps for name, stamps in stamps_ns.items() if stamps["bag"]})
     zero = min(stamps[clock][0] for stamps in stamps_ns.values() if stamps[clock])
     time_s = {name: (np.array(stamps[clock], dtype=np.int64) - zero) / 1e9 for name, stamps in stamps_ns.items()}
-    forces = None
-    if wrenches is not None:
-        force_n = np.array(forces_n, dtype=np.float64).reshape(-1, 3)
-        forces = Forces(time_s=time_s[wrenches], force_n=force_n, source=f"{wrenches} of {path}")
+    force_n, source = np.array(forces_n, dtype=np.float64).reshape(-1, 3), f"{wrenches} of {path}"
+    forces = None if wrenches is None else Forces(time_s=time_s[wrenches], force_n=force_n, source=source)
     return Capture(
         trial=trial_name(path.stem if path.is_file() else path.resolve().name),
         source=f"{images} of {path}",

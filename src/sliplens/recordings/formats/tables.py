@@ -84,6 +84,11 @@ class TextTable:
     path: Path
     header: tuple[str, ...]
     rows: Iterator[tuple[int, list[str]]]  #: Number of the line and text of each column, read once, row by row.
+    row: str = "line"  #: Name of a row in messages.
+
+    def place(self, number: int) -> str:
+        """Return the place of a row for messages."""
+        return f"{self.path}, {self.row} {number}"
 
 
 def open_text_table(path: Path) -> TextTable:
@@ -109,8 +114,7 @@ def open_text_table(path: Path) -> TextTable:
                 deque(_split_lines(path, plain, separator, len(_split(path, *plain[0], separator))), maxlen=0)
             raise RecordingError(f"{path} begins with numbers, not names of columns; begin with time_s,fx,fy,fz")
         rows, header = chain([first], rows), commented[-1]
-    first = next(rows, None)
-    if first is not None:
+    for first in islice(rows, 1):
         units = [cell.strip("[]()") for cell in first[1]]
         measures = [unit for quantity in UNITS for unit in units if _find_unit(unit.lower(), quantity)]
         # most of them, for a letter may be a label
@@ -166,15 +170,12 @@ def _split_lines(
 
 
 def find_column(table: TextTable, name: str, *, option: str) -> str:
-    """Find a column that the user named, in any case, and return its name in the file."""
-    # as it is written, in any case, or without its unit
+    """Find a column that the user named, as it is written, in any case, or without its unit."""
     for form in (str, str.lower, lambda text: re.sub(r" \[.*", "", text.lower())):
-        if same := [column for column in table.header if form(column) == form(name.strip())]:
-            break
-    if len(same) != 1:
-        count = f"{len(same)} columns" if same else "no column"
-        raise RecordingError(f"{table.path} has {count} {name!r}, it has {_quote(table.header)}; name it with {option}")
-    return same[0]
+        same = [column for column in table.header if form(column) == form(name.strip())]
+        if len(same) == 1:
+            return same[0]
+    raise RecordingError(f"{table.path} has no column {name!r}, it has {_quote(table.header)}; name it with {option}")
 
 
 _GROUPED = re.compile(r"([+-]?\d{1,3}(?:([,.'\u2019\s])\d{3})(?:\2\d{3})*)(?:(?!\2)[.,](\d*))?")
@@ -189,15 +190,15 @@ def _without_groups(text: str) -> str:
     return re.sub(r"[^\d+-]", "", grouped[1]) + ("" if grouped[3] is None else f"{text[grouped.end(1)]}{grouped[3]}")
 
 
-def to_number(text: str, *, path: Path, line: int, column: str) -> float:
+def to_number(text: str, *, table: TextTable, line: int, column: str) -> float:
     """Read a finite number, whose decimals may have a comma and whose thousands may be separated."""
     try:
         value = float(_without_groups(text).replace(",", "."))
     except ValueError:
         value = nan
     if not isfinite(value):
-        where = f"{path}, line {line}, {column!r}"
-        raise RecordingError(f"{where} is {text[:40]!r}, not a finite number; mend or drop the line")
+        where = f"{table.place(line)}, {column!r}"
+        raise RecordingError(f"{where} is {text[:40]!r}, not a finite number; mend or drop the {table.row}")
     return value
 
 
@@ -236,20 +237,28 @@ def _axis(words: list[str]) -> str | None:
     return next((axis for axis, end in _AXES.items() if re.search(f"(^|_)({end})$", name)), None)
 
 
+def force_axis(name: str) -> str | None:
+    """Return the axis of a column with a force; None for another column."""
+    words = _words(name)
+    return _axis(words) or _axis(words[:-1])  # the last word may be a unit
+
+
+def is_time(name: str) -> bool:
+    """Return True for a column of times, by its name or its unit."""
+    words, bracket = _words(name), re.search(r"[\[(]\s*(\w+)\s*[\])]", name.lower())
+    if _find_unit(bracket[1] if bracket else words[0] if len(words) == 1 else "", "time"):
+        return True
+    return bool(_TIME & set(words)) and _axis(words) is None  # "f_t" is a tangential force
+
+
 def guess_time_column(header: Sequence[str], *, path: Path) -> str:
-    """Find the column that holds times by its name, or by its unit."""
-    times = []
-    for name in header:
-        words = _words(name)
-        bracket = re.search(r"[\[(]\s*(\w+)\s*[\])]", name.lower())
-        by_unit = _find_unit(bracket[1] if bracket else words[0] if len(words) == 1 else "", "time")
-        if by_unit or (_TIME & set(words) and _axis(words) is None):  # "f_t" is a tangential force
-            times.append(name)
+    """Find the column that holds times."""
+    times = list(filter(is_time, header))
     if len(times) > 1:  # a ROS message has a stamp of its own beside the time of its arrival
         times = [name for name in times if {"header", "stamp"} <= set(_words(name))] or times
     if len(times) != 1:
         looks = f"{len(times) or 'no'} columns that look like the time among {_quote(header)}"
-        raise RecordingError(f"{path} has {looks}; name the right one with --time-column")
+        raise RecordingError(f"{path} has {looks}; name it with --time-column")
     return times[0]
 
 
@@ -264,15 +273,14 @@ def guess_force_columns(header: Sequence[str], *, path: Path) -> tuple[str, ...]
     """Find the columns with the force along x, y and z, or the normal and the tangential force, by their names."""
     columns: dict[str, list[str]] = {axis: [] for axis in _AXES}
     for name in header:
-        words = _words(name)
-        if axis := _axis(words) or _axis(words[:-1]):  # the last word may be a unit
+        if axis := force_axis(name):
             columns[axis].append(name)
     for axes in (("x", "y", "z"), ("shear", "normal"), ("normal", "tangential")):
         names = [name for axis in axes for name in columns[axis]]
         if all(columns[axis] for axis in axes) and len(names) == (2 if "tangential" in axes else 3):
             return tuple(names)
-    looks = "has no columns that look like forces, one an axis (fx, fy, fz or fn, ft),"
-    raise RecordingError(f"{path} {looks} among {_quote(header)}; name them with --force-columns")
+    looks = f"has no columns that look like forces (fx, fy, fz or fn, ft) among {_quote(header)}"
+    raise RecordingError(f"{path} {looks}; name them with --force-columns")
 
 
 def _quote(names: Sequence[str]) -> str:
@@ -280,7 +288,7 @@ def _quote(names: Sequence[str]) -> str:
 
 
 def scale_times(
-    time: Float[np.ndarray, " rows"], lines: Sequence[int], *, path: Path, column: str, unit: str | None = None
+    time: Float[np.ndarray, " rows"], lines: Sequence[int], *, table: TextTable, column: str, unit: str | None = None
 ) -> tuple[Float[np.ndarray, " rows"], str]:
     """Convert times of a column, which must rise, to seconds; return also the unit and where it is known from.
 
@@ -292,11 +300,11 @@ def scale_times(
     if len(wrong):
         before, after = time[wrong[0] : wrong[0] + 2].tolist()
         what = "repeats" if after == before else "falls"
-        where = f"{path}, line {lines[wrong[0] + 1]}"
+        where = table.place(lines[wrong[0] + 1])
         raise RecordingError(f"{where}: {column!r} {what} ({before:.9g}, then {after:.9g}); sort it")
     if unit is not None:
         usual, how = require_unit(unit, quantity="time"), "declared"
-    elif usual := unit_of(column, quantity="time", path=path):
+    elif usual := unit_of(column, quantity="time", path=table.path):
         how = "by its name"
     else:
         size, step = float(np.abs(time[-1])), typical_step(time)
@@ -338,25 +346,24 @@ def require_trial_name(trial: str) -> None:
         raise RecordingError(f"trial {trial[:40]!r} cannot name a file; use letters, digits, dots, dashes, underscores")
 
 
-def read_force_table(path: Path, options: ReadOptions) -> tuple[Forces, tuple[str, ...]]:
-    """Read times and forces from a text table with a header, and notes of what was declared or guessed.
+def read_force_table(table: TextTable, options: ReadOptions) -> tuple[Forces, tuple[str, ...]]:
+    """Read times and forces from a table with a header, and notes of what was declared or guessed.
 
     What is not declared is guessed from the names of the columns (`time_s`, `t [ms]`, `stamp`; `fx`, `force_x [mN]`,
     `wrench.force.x`; `fn` and `ft`), the unit of the time also from its steps.
     """
-    table = open_text_table(path)
-    by_name, in_parts = "by its name", _seconds_and_nanoseconds(table.header)
+    path = table.path
     if options.time_column is not None:
-        in_parts, by_name = (), "declared"
-        times = (find_column(table, options.time_column, option="--time-column"),)
+        times, by_name = (find_column(table, options.time_column, option="--time-column"),), "declared"
     else:
-        times = in_parts or (guess_time_column(table.header, path=path),)
+        times = _seconds_and_nanoseconds(table.header) or (guess_time_column(table.header, path=path),)
+        by_name = "by its name"
     names, by_names = choose_force_columns(table, options)
     numbers, lines, notes = read_numbers(table, (*times, *names), complete=len(times))
-    time = numbers[:, 0] + 1e-9 * numbers[:, 1] if in_parts else numbers[:, 0]
-    time_name, unit = " and ".join(times), "s" if in_parts else options.time_unit
-    time_s, in_time = scale_times(time, lines, path=path, column=time_name, unit=unit)
-    force_n, words = scale_forces(numbers[:, len(times) :], lines, names, options, path=path)
+    time = numbers[:, 0] + 1e-9 * numbers[:, 1] if len(times) == 2 else numbers[:, 0]
+    time_name, unit = " and ".join(times), "s" if len(times) == 2 else options.time_unit
+    time_s, in_time = scale_times(time, lines, table=table, column=time_name, unit=unit)
+    force_n, words = scale_forces(numbers[:, len(times) :], lines, names, options, table=table)
     notes = (
         f"{path.name}: times are those of column {time_name!r} ({by_name}), in {in_time}.",
         f"{path.name}: forces are those of {_quote(names)} as {words[0]} ({by_names}), {words[1]}.",
@@ -381,20 +388,20 @@ def scale_forces(
     names: Sequence[str],
     options: ReadOptions,
     *,
-    path: Path,
+    table: TextTable,
 ) -> tuple[Float[np.ndarray, "rows 3"], tuple[str, str]]:
     """Convert forces of columns to newtons along x, y, z; return also words for the axes and the units."""
     if options.force_unit is not None:
         units, how_force = [require_unit(options.force_unit, quantity="force")] * len(names), "declared"
     else:
-        in_names = [unit_of(name, quantity="force", path=path) for name in names]
+        in_names = [unit_of(name, quantity="force", path=table.path) for name in names]
         units = [unit or "N" for unit in in_names]
         how_force = "assumed, for the names give no unit" if None in in_names else "by their names"
     forces = forces * np.array([UNITS["force"][unit][0] for unit in units])
     large = np.any(np.abs(forces) > MOST_FORCE_N, axis=1)
     if large.any():
         at = int(np.argmax(large))
-        size = f"{path}, line {lines[at]}: {np.nanmax(np.abs(forces[at])):.4g} N is no force of a fingertip"
+        size = f"{table.place(lines[at])}: {np.nanmax(np.abs(forces[at])):.4g} N is no force of a fingertip"
         raise RecordingError(f"{size}; declare the right one with --force-unit")
     axes = "x, y, z"
     if len(names) == 2:  # z points into the gel; the tangential force has no direction
@@ -414,10 +421,8 @@ def read_numbers(
         for number, place in enumerate(places):
             cell = _without_groups(cells[place])
             commas, points = commas or "," in cell, points or "." in cell
-            if number >= complete and cell.lower() in _LACKING:
-                values.append(nan)
-            else:
-                values.append(to_number(cell, path=table.path, line=line, column=table.header[place]))
+            lacks = number >= complete and cell.lower() in _LACKING
+            values.append(nan if lacks else to_number(cell, table=table, line=line, column=table.header[place]))
     if not lines:
         raise RecordingError(f"{table.path} has a header but no row; record the force sensor too")
     if commas and points:
@@ -431,7 +436,9 @@ def place_on_clock(
 ) -> tuple[Float[np.ndarray, " frames"], Forces | None, tuple[str, ...]]:
     """Return times of frames on the clock of the forces in the table beside them, these forces, and notes."""
     start_s = options.start_s
-    samples, notes = (None, ()) if options.forces is None else read_force_table(options.forces, options)
+    samples, notes = (
+        (None, ()) if options.forces is None else read_force_table(open_text_table(options.forces), options)
+    )
     if start_s is not None:
         if not isfinite(start_s):
             raise RecordingError(f"the first frame cannot start at {start_s} s; give the time of the force clock")

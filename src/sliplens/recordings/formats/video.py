@@ -50,8 +50,8 @@ def open_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
                 raise RecordingError(f"{path} has no video stream; name the file that the camera wrote")
             codec = streams[0].codec_context
             if codec is not None and not 0 < codec.height * codec.width <= MOST_PIXELS:
-                size = f"{codec.width} x {codec.height}"
-                raise RecordingError(f"{path} claims frames of {size} pixels; the file is damaged, copy it")
+                size = f"{codec.width} x {codec.height} pixels"
+                raise RecordingError(f"{path} claims frames of {size}; the file is damaged, copy it")
             if codec is None or codec.format is None:
                 raise RecordingError(f"{path} is coded in a way that FFmpeg cannot read; export it as FFV1 or H.264")
             if max(part.bits for part in codec.format.components) >= 16:
@@ -121,22 +121,22 @@ def _decode(
         try:
             for frame in container.decode(video):
                 if frame.is_corrupt:
-                    raise RecordingError(_damaged(path, count, "it is incomplete"))
+                    raise _damaged(path, count, "it is incomplete")
                 if count == frames or not (stamps is None or frame.pts in {None, stamps[count]}):
-                    raise RecordingError(_damaged(path, count, "its stamp is not among those of the file"))
+                    raise _damaged(path, count, "its stamp is not among those of the file")
                 pixels = upright(frame, to_rgb.reformat(frame, format="rgb24").to_ndarray(), where=path)
                 if pixels.shape[:2] != size:
-                    raise RecordingError(_damaged(path, count, "it is of another size than the first"))
+                    raise _damaged(path, count, "it is of another size than the first")
                 count += 1
                 yield pixels
         except FFmpegError as error:
-            raise RecordingError(_damaged(path, count, error.strerror)) from None
+            raise _damaged(path, count, error.strerror) from None
     if count < frames:
-        raise RecordingError(_damaged(path, count, f"the file has stamps of {number_of(frames, 'frame')}"))
+        raise _damaged(path, count, f"the file has stamps of {number_of(frames, 'frame')}")
 
 
-def _damaged(path: Path, frame: int, reason: str | None) -> str:
-    return f"frame {frame} of {path} cannot be decoded ({reason}); the file is damaged, copy or export it again"
+def _damaged(path: Path, frame: int, reason: str | None) -> RecordingError:
+    return RecordingError(f"frame {frame} of {path} cannot be decoded ({reason}); the file is damaged, copy it again")
 
 
 def read_video(path: Path, options: ReadOptions) -> Capture:
@@ -144,8 +144,7 @@ def read_video(path: Path, options: ReadOptions) -> Capture:
 
     Of a video that was cut off, the frames up to the cut are kept.
     """
-    packets: list[int | None] = []
-    cut, stamps, time_s, notes = False, None, None, list[str]()
+    packets, cut, stamps, time_s, notes = list[int | None](), False, None, None, list[str]()
     with open_video(path) as (container, video):
         # AVI counts frames; the presentation stamps made up from that are late where frames are reordered
         counted = container.format.name == "avi"
@@ -156,7 +155,7 @@ def read_video(path: Path, options: ReadOptions) -> Capture:
                     packets.append(packet.dts if counted else packet.pts)
                     cut = packet.is_corrupt
         except FFmpegError as error:
-            raise RecordingError(_damaged(path, len(packets), error.strerror)) from None
+            raise _damaged(path, len(packets), error.strerror) from None
         if packets and None not in packets and video.time_base is not None:
             stamps = np.sort(np.array(packets, dtype=np.int64))
             # the clock of a transport stream starts anywhere
@@ -171,9 +170,9 @@ def read_video(path: Path, options: ReadOptions) -> Capture:
     (size, loss), frames = read_size(path), len(packets)
     decode = partial(_decode, path, frames=frames, stamps=None if counted else stamps, size=size)
     if cut:
-        frames, decoded = 0, decode()
+        frames = 0
         with suppress(RecordingError):
-            while next(decoded, None) is not None:
+            for _ in decode():
                 frames += 1
         whole = f"{number_of(frames, 'frame')} before the cut were kept"
         notes.append(f"{path.name}: the file is cut off: {whole}; copy it again if it was longer.")
