@@ -18,10 +18,8 @@ from sliplens.files import parse_json, require_file
 from sliplens.friction import MOST_FRICTION, Friction
 from sliplens.images import read_image, write_png
 from sliplens.progress import visible
-from sliplens.recordings.capture import Forces
 from sliplens.recordings.labelling import FrictionEstimate
 from sliplens.recordings.labels.axes import middles
-from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.store import save_recording, stream_frames
 from sliplens.recordings.trial import Recording
 
@@ -178,12 +176,6 @@ def test_friction_of_nothing_that_slides_is_refused():
     assert Friction(MOST_FRICTION).mean == pytest.approx(MOST_FRICTION)
 
 
-def test_a_time_that_is_no_number_is_refused():
-    for time in ([0.0, np.inf], [0.0, np.nan]):
-        with pytest.raises(RecordingError, match=r"sample 1 is (inf|nan), no number"):
-            Forces(time_s=np.array(time), force_n=np.zeros((2, 3)), source="forces.csv")
-
-
 @given(st.text(max_size=30))
 def test_a_terminal_obeys_nothing_of_a_file(text: str):
     shown = visible(text)
@@ -191,8 +183,3 @@ def test_a_terminal_obeys_nothing_of_a_file(text: str):
     assert visible(shown) == shown
     if text.isprintable():
         assert shown == text
-
-
-def test_a_profile_may_name_no_file_elsewhere():
-    with pytest.raises(ValueError, match="name has letters"):
-        SensorProfile(name="../tip")

@@ -89,7 +89,7 @@ def test_what_the_makers_software_hands_on_is_not_cropped_or_turned_twice():
         ("name = 'tip'\ncrop_px = [0, 0, 90, 90]\ncamera_size_px = [64, 48]", "not inside"),
         ("name = 'tip'\ncrop_px = [0, 0, 9, 9]", "camera_size_px"),
         ("name = 'tip'\nrotate_deg = 45", "rotate_deg"),
-        ("name = 'a/b'", "letters"),
+        ("name = '../tip'", "letters"),
         ("name = ", "TOML"),
         ("colours = 'rgb'", "name"),
     ],

@@ -22,7 +22,10 @@ def test_time_must_rise(recording: Recording):
         replace(recording, time_s=time)
 
 
-@pytest.mark.parametrize(("step_s", "words"), [(1e9, "more than a day"), (1e-9, "declare the right unit of time")])
+@pytest.mark.parametrize(
+    ("step_s", "words"),
+    [(1e9, "more than a day"), (1e-9, "the right unit of time"), (np.inf, "is inf, no number"), (np.nan, "is nan")],
+)
 def test_times_that_no_sensor_has_are_refused_before_any_array_is_made_of_their_span(step_s: float, words: str):
     time_s = np.append(0, step_s + np.arange(200) * min(step_s, 0.01))
     with pytest.raises(RecordingError, match=words):
