@@ -409,17 +409,17 @@ def run_table(
             schema = make(output.folder)
             deque(rows(output.folder) if on_rows is not None else (), maxlen=0)
             return schema, None
-    with scratch_folder() if out is None else _parts_beside(out, resumable=resumable, overwrite=overwrite) as folder:
+    with scratch_folder() if out is None else _parts_beside(out, resumable=resumable, replaces=overwrite) as folder:
         schema = make(folder)
         return schema, write_tables(regrouped(rows(folder), rows=LONGEST), out, schema)
 
 
 @contextmanager
-def _parts_beside(out: Path, *, resumable: bool, overwrite: bool) -> Iterator[Path]:
+def _parts_beside(table: Path, *, resumable: bool, replaces: bool) -> Iterator[Path]:
     """Open the folder of the parts of a table, which stays after an interruption."""
-    folder = partial_folder(out)
-    with locked(out):
-        require_new_file(out, overwrite=overwrite)
+    folder = partial_folder(table)
+    with locked(table):
+        require_new_file(table, overwrite=replaces)
         if not resumable:
             remove(folder)
         try:
