@@ -11,12 +11,11 @@ from sliplens.simulation import CHROMATOUCH, FLAT_GEL, Sensor
 
 KINDS = [(CHROMATOUCH, "chromatouch"), (CHROMATOUCH, ""), (FLAT_GEL, "")]
 TURNS = {
-    "turned by 90 degrees": lambda images: np.rot90(images, axes=(-2, -3)),
-    "turned by 180 degrees": lambda images: np.rot90(images, 2, axes=(-3, -2)),
-    "mirrored": lambda images: images[..., ::-1, :],
+    "turned by 90 degrees": (lambda images: np.rot90(images, axes=(-2, -3)), 180.0, 1),
+    "turned by 180 degrees": (lambda images: np.rot90(images, 2, axes=(-3, -2)), 270.0, 1),
+    "mirrored": (lambda images: images[..., ::-1, :], 90.0, -1),
 }
-"""Of frame and reference together, and where each takes a pull of 90 degrees."""
-LANDS_AT = {"turned by 90 degrees": 180.0, "turned by 180 degrees": 270.0, "mirrored": 90.0}
+"""Of frame and reference together, where each takes a pull of 90 degrees, and the sense in which it turns others."""
 
 
 def angle(first_deg: float, second_deg: float) -> float:
@@ -38,15 +37,12 @@ def test_the_shear_points_where_the_pull_does(sensor: Sensor, kind: str, directi
 
 @pytest.mark.parametrize("turn", TURNS)
 def test_the_direction_turns_with_frame_and_reference(turn: str):
-    reference, frames = pulled_frames(90.0, 0)
+    (reference, frames), (change, lands_at, sense) = pulled_frames(90.0, 0), TURNS[turn]
     straight = ShearEstimator(reference, "chromatouch").estimate(frames[0])
-    turned = ShearEstimator(np.ascontiguousarray(TURNS[turn](reference)), "chromatouch").estimate(
-        np.ascontiguousarray(TURNS[turn](frames[0]))
-    )
-    off_deg = straight.direction_deg - 90.0
+    changed = [np.ascontiguousarray(change(image)) for image in (reference, frames[0])]
+    turned = ShearEstimator(changed[0], "chromatouch").estimate(changed[1])
     # blocks of 3 x 3 pixels leave out the last two of 224 rows, so patches shift by a pixel or two: some degrees
-    expected = LANDS_AT[turn] + (-off_deg if turn == "mirrored" else off_deg)
-    assert angle(turned.direction_deg, expected) < 5
+    assert angle(turned.direction_deg, lands_at + sense * (straight.direction_deg - 90.0)) < 5
 
 
 @pytest.mark.parametrize(("sensor", "kind"), KINDS, ids=["dome", "dome, general weights", "flat gel"])
