@@ -83,16 +83,10 @@ def _best(
     values: Float[np.ndarray, "samples draws"],
 ) -> tuple[Int[np.ndarray, " draws"], Float[np.ndarray, " draws"]]:
     """Return the index of the break that fits each column best, and the level there."""
-    draws = values.shape[1]
-    explained, chosen, levels = np.full(draws, -np.inf), np.zeros(draws, dtype=int), np.zeros(draws)
-    for index, (basis, triangle) in enumerate(zip(bases, triangles, strict=True)):
-        shares = basis.T @ values
-        power = np.sum(shares**2, axis=0)
-        better = power > explained
-        if better.any():
-            explained[better], chosen[better] = power[better], index
-            levels[better] = np.linalg.solve(triangle, shares[:, better])[0]
-    return chosen, levels
+    shares = np.swapaxes(bases, 1, 2) @ values
+    chosen = np.argmax(np.sum(shares**2, axis=1), axis=0)
+    best = shares[chosen, :, np.arange(values.shape[1]), None]
+    return chosen, np.linalg.solve(triangles[chosen], best)[:, 0, 0]
 
 
 def _blocks(residuals: Samples, *, draws: int, rng: np.random.Generator) -> Int[np.ndarray, "samples draws"]:
