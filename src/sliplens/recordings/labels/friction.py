@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sliplens.errors import RecordingError
+from sliplens.friction import MOST_FRICTION
 from sliplens.recordings.labelling import BY_HAND, FrictionEstimate
 from sliplens.recordings.labels import axes
 from sliplens.recordings.labels.axes import ContactForces, Samples, Times
@@ -130,15 +131,6 @@ class ImageMotion:
     motion: Float[np.ndarray, " frames"]  #: See `measure_motion`; the first value is not used.
 
 
-class _Slip(NamedTuple):
-    """Onset of a slip, and the friction at it with its 68 % interval; None where the samples about it are too few."""
-
-    time_s: float
-    mu: float | None = None
-    low: float = np.nan
-    high: float = np.nan
-
-
 class _MeanRatio(NamedTuple):
     """Forces averaged about each sample, and their ratio where something presses; 0 elsewhere."""
 
@@ -200,7 +192,7 @@ def estimate_friction(
         visible = [time_s for time_s in times if _is_seen(image, *_find_gap(forces.time_s, time_s))]
         target = elsewhere if slip_s is not None and start <= slip_s <= end else rough
         target += (visible or times)[:1]
-    slips: list[_Slip] = []
+    slips: list[FrictionEstimate] = []
     for time_s in [*sorted(rough if slip_s is None else [*rough, slip_s]), *elsewhere]:
         reach_s = 0.0 if time_s == slip_s else _REACH_S
         limits = {"contact_threshold_n": contact_threshold_n, "reach_s": reach_s, "draws": draws}
@@ -209,33 +201,27 @@ def estimate_friction(
         except RecordingError:
             if mu is None and not slips:
                 raise
-            slips.append(_Slip(time_s))  # the friction is known without it
+            value = slips[0].mu if mu is None else mu  # the friction is known without it
+            slips.append(FrictionEstimate(mu=value, low=value, high=value, onset_s=time_s))
     other = slips.pop() if elsewhere else None
     # the window that shows most surely how far the ratio reaches
     mean = max(means, key=lambda mean: float(mean.least.max()))
     first = slips[0] if slips else None
-    compared = other if mu is None else first
     if mu is not None:
-        low, high, method = mu, mu, BY_HAND
-    elif first is None or first.mu is None:
+        estimate = FrictionEstimate(mu=mu, low=mu, high=mu, onset_s=first and first.onset_s)
+    elif first is None:
         never = f"the trial never slips (F_t / F_n reaches {mean.ratio[mean.least.argmax()]:.2f} without breaking off)"
         raise RecordingError(f"{never}, so its friction is unknown; give it with --mu, or in a manifest")
+    elif first.low <= 0:
+        interval = f"{first.mu:.2g} with a 68 % interval from {first.low:.2g} to {first.high:.2g}, which is none"
+        raise RecordingError(f"the slip at {first.onset_s:.2f} s gives a friction of {interval}; give it with --mu")
+    elif first.onset_s == slip_s:
+        estimate = replace(first, method="F_t / F_n at the slip set by hand")
     else:
-        mu, low, high, method = first.mu, first.low, first.high, "F_t / F_n at the slip set by hand"
-        if low <= 0:
-            interval = f"{mu:.2g} with a 68 % interval from {low:.2g} to {high:.2g}, which is none"
-            raise RecordingError(f"the slip at {first.time_s:.2f} s gives a friction of {interval}; give it with --mu")
-        if first.time_s != slip_s:
-            moves = _is_seen(image, *_find_gap(forces.time_s, first.time_s))
-            method = "break of F_t / F_n" + (", seen in the image" if moves else "")
-    estimate = FrictionEstimate(
-        mu=mu,
-        low=low,
-        high=high,
-        method=method,
-        onset_s=first and first.time_s,
-        later_onsets_s=tuple(slip.time_s for slip in slips[1:]),
-    )
+        moves = _is_seen(image, *_find_gap(forces.time_s, first.onset_s or 0.0))
+        estimate = replace(first, method="break of F_t / F_n" + (", seen in the image" if moves else ""))
+    estimate = replace(estimate, later_onsets_s=tuple(slip.onset_s or 0.0 for slip in slips[1:]))
+    compared = other if mu is None else first
     notes, error = _find_contradictions(estimate, compared, means=mean, slip_s=slip_s, friction_change=friction_change)
     if not notes:
         return estimate
@@ -246,7 +232,7 @@ def estimate_friction(
 
 def _find_contradictions(
     friction: FrictionEstimate,
-    slip: _Slip | None,
+    slip: FrictionEstimate | None,
     *,
     means: _MeanRatio,
     slip_s: float | None,
@@ -256,10 +242,12 @@ def _find_contradictions(
     mu, declared, ratio, time = friction.mu, friction.method == BY_HAND, means.ratio, means.time_s
     written = f"{mu:.2f}" if declared else f"{mu:.2f} ({friction.low:.2f} to {friction.high:.2f})"
     notes, error, counts = [], 0.0, "whose difference counts as an error of the friction"
-    if slip is not None and slip.mu is not None:
+    if slip is not None:
         apart = abs(slip.mu - mu)
-        if apart > max(LAW_SIGMAS * np.hypot(friction.sigma, (slip.high - slip.low) / 2), _LAW_SHARE * mu):
-            falls = f"F_t / F_n is {slip.mu:.2f} ({slip.low:.2f} to {slip.high:.2f}) at the slip at {slip.time_s:.2f} s"
+        if apart > max(LAW_SIGMAS * np.hypot(friction.sigma, slip.sigma), _LAW_SHARE * mu):
+            falls = (
+                f"F_t / F_n is {slip.mu:.2f} ({slip.low:.2f} to {slip.high:.2f}) at the slip at {slip.onset_s:.2f} s"
+            )
             origin = "was given" if declared else f"follows from the slip that was set to {friction.onset_s:.2f} s"
             notes.append(
                 f"{falls}, and a friction of {written} {origin}, {counts}; leave it out, or set --slip-s there"
@@ -298,7 +286,7 @@ def _fit_slip(
     reach_s: float,
     rng: np.random.Generator,
     draws: int,
-) -> _Slip:
+) -> FrictionEstimate:
     """Fit the break of the ratio about the rough time of a slip."""
     time, step = forces.time_s, axes.typical_step(forces.time_s)
     between_s = _find_gap(time, rough_s)
@@ -334,7 +322,9 @@ def _fit_slip(
     (normal,), (tangential,) = forces.tare_sigma_n(np.array([fit.time_s]))
     tare = np.hypot(tangential, fit.level * normal)
     low, high = np.quantile(fit.levels + rng.normal(0, float(tare) / normal_n, draws), _BAND)
-    return _Slip(fit.time_s, fit.level, float(min(low, fit.level)), float(max(high, fit.level)))
+    low, high = float(min(low, fit.level)), float(max(high, fit.level))
+    mu = float(np.clip(fit.level, 1e-9, MOST_FRICTION))  # where the interval reaches 0 there is none
+    return FrictionEstimate(mu=mu, low=low, high=high, onset_s=fit.time_s)
 
 
 def _mean_ratio(forces: ContactForces, *, window_s: float, contact_threshold_n: float) -> _MeanRatio:
