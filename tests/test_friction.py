@@ -60,7 +60,7 @@ def test_what_is_no_friction_is_refused(told: object):
         as_friction(told)  # pyright: ignore[reportArgumentType]
 
 
-@pytest.mark.parametrize(("ratio", "sigma"), [(0.0, 0.1), (0.5, 0.0), (float("nan"), 0.1)])
+@pytest.mark.parametrize(("ratio", "sigma"), [(0.0, 0.1), (0.5, 0.0), (np.nan, 0.1)])
 def test_impossible_slips_and_weights_are_refused(ratio: float, sigma: float):
     with pytest.raises(InputError, match="a slip needs a positive ratio"):
         Friction.between(0.2, 1.0).update(ratio, sigma)

@@ -153,9 +153,7 @@ def test_a_friction_that_contradicts_the_forces_is_off_by_as_much_and_says_so(
     assert friction.sigma >= abs(friction.mu - shown) - 0.01
 
 
-def test_without_a_slip_no_ratio_exceeds_the_friction_that_is_given(
-    trial_without_slip: Trial, rng: np.random.Generator
-):
+def test_without_a_slip_no_ratio_exceeds_a_given_friction(trial_without_slip: Trial, rng: np.random.Generator):
     contact = trial_without_slip.contact(noise_n=0.02, rng=rng)
     (note,) = estimate(contact, rng, mu=0.4).notes
     assert "nothing slips" in note

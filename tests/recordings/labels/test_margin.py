@@ -113,7 +113,7 @@ def test_frames_without_samples_have_no_label(trial: Trial):
     assert np.all(np.isnan(labels.normal_force_n[missing]))
 
 
-def test_a_lag_is_applied_only_when_asked(trial: Trial):
+def test_a_lag_is_applied_only_when_asked_and_counts_as_an_error_otherwise(trial: Trial):
     plain = label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION)
     known = label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION, lag=LAG)
     applied = label_frames(trial.frame_time_s + 0.04, trial.contact(), friction=FRICTION, lag=LAG, settings=APPLIED)
@@ -121,12 +121,11 @@ def test_a_lag_is_applied_only_when_asked(trial: Trial):
     np.testing.assert_allclose(applied.safety_margin, plain.safety_margin, atol=1e-9)
     np.testing.assert_allclose(applied.force_time_s, trial.frame_time_s, atol=1e-12)
     assert (known.basis.lag_applied, applied.basis.lag_applied) == (False, True)
-
-
-def test_an_unapplied_lag_is_an_error_of_its_size(trial: Trial):
-    known = label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION, lag=LAG)
+    doubtful = replace(LAG, doubt="several lags fit alike")
+    with pytest.raises(RecordingError, match="the lag cannot be applied: several lags fit alike; give the lag by hand"):
+        label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION, lag=doubtful, settings=APPLIED)
     pulled = (trial.frame_time_s > PULL_S + 0.2) & (trial.frame_time_s < SLIP_S - 0.2)
-    # without noise the slope of the margin is all that is left: 1 in 3 s
+    # one that is not applied is an error of its size; without noise nothing else is left: 1 in 3 s
     expected = np.hypot(LAG.lag_s, LAG.sigma_s) / (SLIP_S - PULL_S)
     np.testing.assert_allclose(known.safety_margin_sigma[pulled], expected, rtol=1e-6)
 
@@ -141,12 +140,6 @@ def test_the_noise_is_not_counted_again_as_an_effect_of_the_lag(trial: Trial, rn
     # the margin falls by 1 in 3 s; over a chord of 0.2 s the noise adds half a per cent of its variance, and may double
     noise = 0.01 * np.mean(sure.safety_margin_sigma[pulled] ** 2)
     assert more == pytest.approx((0.01 / (SLIP_S - PULL_S)) ** 2, abs=float(noise))
-
-
-def test_a_doubtful_lag_is_not_applied(trial: Trial):
-    doubtful = replace(LAG, doubt="several lags fit alike")
-    with pytest.raises(RecordingError, match="the lag cannot be applied: several lags fit alike; give the lag by hand"):
-        label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION, lag=doubtful, settings=APPLIED)
 
 
 def test_friction_moves_the_margin_by_its_share(trial: Trial):

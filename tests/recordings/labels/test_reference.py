@@ -63,14 +63,10 @@ def test_memory_does_not_grow_with_the_untouched_stretch():
     assert peak(4000) < peak(400) + 1e6
 
 
-def test_a_named_frame_is_taken_even_if_it_touches():
+def test_a_named_frame_may_touch_and_a_recording_that_begins_pressed_has_its_reference_after_that():
     film = Film()
     reference = choose_reference(film.read, film.untouched, index=10)
     assert (reference.index, reference.method) == (10, "named")
-
-
-def test_a_recording_that_begins_pressed_has_its_reference_after_that():
-    film = Film()
     film.untouched[:8] = False
     assert (choose_reference(film.read, film.untouched).index or 0) >= 14
 
