@@ -292,9 +292,9 @@ def _fit_slip(
     between_s = _find_gap(time, rough_s)
     hidden = between_s[1] > between_s[0] and reach_s > 0
     until_s = between_s[0] if hidden else rough_s
-
-    def fit_near(before_s: float) -> tuple[Break, float]:
-        near = time >= until_s - max(before_s, _BEFORE_STEPS * step)
+    lengths_s = list(_BEFORE_S)
+    while True:
+        near = time >= until_s - max(lengths_s.pop(0), _BEFORE_STEPS * step)
         near &= time <= until_s + (0 if hidden else max(_AFTER_S, _AFTER_STEPS * step))
         near &= forces.normal_n > contact_threshold_n
         before = near & (time <= until_s)
@@ -303,25 +303,19 @@ def _fit_slip(
         pull = forces.tangential_n[before].mean(axis=0)
         # along the direction of the pull: a projection is not biased by noise
         ratio = forces.tangential_n[near] @ (pull / np.linalg.norm(pull)) / forces.normal_n[near]
-        fit = (
-            bracket_break(time[near], ratio, between_s=between_s, rng=rng, draws=draws)
-            if hidden
-            else fit_break(time[near], ratio, about_s=rough_s, rng=rng, draws=draws, reach_s=reach_s)
-        )
-        return fit, float(forces.normal_n[near].mean())
-
-    fit, normal_n = fit_near(_BEFORE_S[0])
-    for before_s in _BEFORE_S[1:]:
+        if hidden:
+            fit = bracket_break(time[near], ratio, between_s=between_s, rng=rng, draws=draws)
+            break
+        fit = fit_break(time[near], ratio, about_s=rough_s, rng=rng, draws=draws, reach_s=reach_s)
         top = np.abs(means.time_s - fit.time_s) <= _STEP_S
         apart = abs(fit.level - means.ratio[top].max(initial=0.0))
         like = _LIKE_SHARE * fit.level + _LIKE_SIGMAS * means.sigma[top].max(initial=0.0)
-        if hidden or reach_s == 0 or apart <= like:
+        if reach_s == 0 or not lengths_s or apart <= like:
             break
-        fit, normal_n = fit_near(before_s)
     # no resampling of the slip can show the uncertainty of the tare
     (normal,), (tangential,) = forces.tare_sigma_n(np.array([fit.time_s]))
-    tare = np.hypot(tangential, fit.level * normal)
-    low, high = np.quantile(fit.levels + rng.normal(0, float(tare) / normal_n, draws), _BAND)
+    tare = float(np.hypot(tangential, fit.level * normal)) / float(forces.normal_n[near].mean())
+    low, high = np.quantile(fit.levels + rng.normal(0, tare, draws), _BAND)
     low, high = float(min(low, fit.level)), float(max(high, fit.level))
     mu = float(np.clip(fit.level, 1e-9, MOST_FRICTION))  # where the interval reaches 0 there is none
     return FrictionEstimate(mu=mu, low=low, high=high, onset_s=fit.time_s)
