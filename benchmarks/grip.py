@@ -268,7 +268,6 @@ def compare_all(options: argparse.Namespace, rng: np.random.Generator) -> dict[s
 
 RUN = load(DEFAULT_NETWORK)
 _TABLE = load_readings(RUN)
-assert _TABLE is not None  # it comes with the network
 READINGS = replace(
     _TABLE,
     seed=_TABLE.seed + CHOSEN,

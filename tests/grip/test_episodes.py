@@ -1,12 +1,12 @@
 """Episodes: the same draws for all, readings as they were measured, loops that close, folders that go on."""
 
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from constant_controller import Constant
 
 import sliplens as sl
 from sliplens.codec import load_result
@@ -32,26 +32,19 @@ from sliplens.grip.records import Grip
 from sliplens.models import Network
 
 
-@cache
-def shipped() -> Network:
+@pytest.fixture(scope="module")
+def network() -> Network:
     return sl.load(DEFAULT_NETWORK)
 
 
 @pytest.fixture(scope="module")
-def network() -> Network:
-    return shipped()
-
-
-@pytest.fixture(scope="module")
 def table(network) -> ReadingTable:
-    found = load_readings(network)
-    assert found is not None
-    return found
+    return load_readings(network)
 
 
 def few(controller: str | Controller, condition: str = "dry", **options: Any) -> Grip:
-    call: dict[str, Any] = {"episodes": 40, "seed": 7, "network": shipped()}
-    return run_episodes("cup", controller, condition=condition, **call | options)
+    options = {"episodes": 40, "seed": 7} | options
+    return run_episodes("cup", controller, condition=condition, **options)
 
 
 def scripted(condition: str = "dry", *, episodes: int = 1, **columns: float) -> Scripts:
@@ -122,10 +115,7 @@ def test_the_loop_detects_slip_as_a_real_hold_does_and_only_where_an_object_slid
         eyes = TableSensor(table, fingertips=np.arange(6.0), rng=np.random.default_rng(0))
         loop = GripLoop(Plant(OBJECTS["cup"], episodes=6), eyes, make_controller("fixed", {"force_n": 1.5}))
         ticks = [loop.tick(scripts.world(loop.plant.state.time_s)) for _ in range(180)]
-        slip, time_s = (
-            np.array([tick.slip for tick in ticks]),
-            np.array([tick.state.time_s for tick in ticks]),
-        )
+        slip, time_s = np.array([tick.slip for tick in ticks]), np.array([tick.state.time_s for tick in ticks])
         # as an object leaves the table, and as the hand stops at 2 s, it swings: the load falls, as in a slip
         assert not slip[(time_s > 2.2) & (time_s < 2.5)].any()
         assert slip[time_s > 2.5].any(axis=0).all() == (factor < 1)
@@ -146,20 +136,12 @@ def test_the_loop_closes_through_pixels(network):
 
 
 def test_a_reading_comes_as_late_as_is_said():
-    times = []
-
-    class Note:
-        def command(self, seen):
-            times.append((seen.time_s, float(seen.force_n[0])))
-            return np.full_like(seen.force_n, 1.0)
-
     for latency, ticks in ((0.0, 0), (0.02, 2), (0.1, 6)):
-        times.clear()
-        scripts = draw_scripts("cup", "dry", episodes=1, seed=0)
-        loop = GripLoop(Plant(OBJECTS["cup"]), None, Note(), latency_s=latency)
-        after = [loop.tick(scripts.world(loop.plant.state.time_s)).state.force_n[0] for _ in range(12)]
-        forces = [0.0, *map(float, after)]
-        assert [force for _, force in times][ticks:] == forces[: 12 - ticks]
+        scripts, controller = scripted(), Constant(force_n=1.0)
+        loop = GripLoop(Plant(OBJECTS["cup"]), None, controller, latency_s=latency)
+        after = [loop.tick(scripts.world(loop.plant.state.time_s)).state.force_n for _ in range(12)]
+        given = [observation.force_n for observation in controller.observations]
+        np.testing.assert_array_equal(given[ticks:], [np.zeros(1), *after][: 12 - ticks])
 
 
 def test_the_hand_s_speed_is_the_slope_of_its_height_and_ends_at_rest():
@@ -199,11 +181,13 @@ def test_an_interrupted_run_goes_on_to_the_same_record(tmp_path: Path, monkeypat
     assert not (tmp_path / "grip" / "parts").exists()
 
 
-def told_table(table: ReadingTable) -> ReadingTable:
-    """Readings of three quarters of F_t / F_n, as if a network told it."""
+def ratio_sensor(table: ReadingTable, known: list[Friction], **options: float) -> TableSensor:
+    """Sensor of three quarters of F_t / F_n, as if a network predicted it."""
     friction, _, margins = np.meshgrid(FRICTIONS, FORCES_N, MARGINS, indexing="ij")
     ratio = np.broadcast_to(0.75 * friction * (1 - margins), table.margin.shape).astype(np.float32)
-    return replace(table, ratio={"mean": ratio, "sigma": np.full_like(ratio, 0.02)}, ratio_noise=0.0)
+    table = replace(table, ratio={"mean": ratio, "sigma": np.full_like(ratio, 0.02)}, ratio_noise=0.0)
+    learners, rng = list(map(SlipLearner, known)), np.random.default_rng(0)
+    return TableSensor(table, fingertips=np.arange(3.0), rng=rng, learners=learners, **options)
 
 
 def pulled(friction: float, ratio: float) -> Plant:
@@ -217,14 +201,8 @@ def pulled(friction: float, ratio: float) -> Plant:
 
 @pytest.mark.parametrize(("scale", "read"), [(0.0, 0.24), (1.0, 0.18)])
 def test_a_friction_that_is_told_makes_the_margin_of_the_ratio(table, scale, read):
-    known, options = [Friction(0.3), Friction(0.6), Friction.between(0.3, 0.9)], {"fingertips": np.arange(3.0)}
-    eyes = TableSensor(
-        told_table(table),
-        rng=np.random.default_rng(0),
-        error_scale=scale,
-        learners=[SlipLearner(one) for one in known],
-        **options,
-    )
+    known = [Friction(0.3), Friction(0.6), Friction.between(0.3, 0.9)]
+    eyes = ratio_sensor(table, known, error_scale=scale)
     sight = eyes.measure(pulled(0.3, 0.24).state, np.full(3, np.nan))
     for row, friction in enumerate(known):
         values, weights = friction.nodes
@@ -236,12 +214,7 @@ def test_a_friction_that_is_told_makes_the_margin_of_the_ratio(table, scale, rea
 
 
 def test_a_slip_narrows_what_was_told_of_friction(table):
-    eyes = TableSensor(
-        told_table(table),
-        fingertips=np.zeros(3),
-        rng=np.random.default_rng(0),
-        learners=[SlipLearner(Friction.between(0.1, 0.9)) for _ in range(3)],
-    )
+    eyes = ratio_sensor(table, [Friction.between(0.1, 0.9)] * 3)
     plant, none = pulled(0.3, 0.29), np.full(3, np.nan)
     before = eyes.measure(plant.state, none)
     plant.state = replace(plant.state, time_s=0.1)

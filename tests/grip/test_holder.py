@@ -1,6 +1,5 @@
 """Laws of the holder: each margin counts with its own force, and the grip is never loosened blindly."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lying_gripper import CEILING_N, LIES, WIRE, hold
 
-from sliplens.grip.controllers import CONTROLLERS, Holder, MarginLaw, Observation
+from sliplens.grip.controllers import CONTROLLERS, Holder, MarginLaw
 from sliplens.grip.plant import PERIOD_S
 from sliplens.live.reading import Reading, SlipState
 
@@ -93,14 +92,6 @@ def test_a_force_that_does_not_follow_the_commands_is_a_trouble_and_held(share):
     assert answer.command_n >= 2.0
 
 
-@dataclass
-class Loosens:
-    """Controller of somebody else, which lets go whatever is read."""
-
-    def command(self, observation: Observation, /) -> np.ndarray:
-        return 0.0 * observation.command_n
-
-
 @given(
     name=st.sampled_from([*(name for name in CONTROLLERS if name != "oracle"), "own"]),
     command_n=st.floats(0.6, 4.0),
@@ -110,7 +101,7 @@ class Loosens:
 )
 def test_below_the_margin_aimed_at_no_controller_commands_less_than_before(name, command_n, share, read):
     """What is acted on is at most what is read: a reading under the target is a margin under it, but for noise."""
-    holder = Holder(Loosens() if name == "own" else name, ceiling_n=5.0, command_n=command_n)
+    holder = Holder(Constant(force_n=0.0) if name == "own" else name, ceiling_n=5.0, command_n=command_n)
     before = command_n
     controller: Any = holder.controller
     for step, margin in enumerate(read):

@@ -17,5 +17,6 @@ def pulled_frames(
     """Untouched sensor, and a frame at each margin, pressed with 1.5 N at a friction of 0.8."""
     nuisances = Nuisances(shear_direction_deg=(direction_deg, direction_deg))
     fingertip = Fingertip(seed=seed, sensor=sensor, nuisances=nuisances)
-    frames = np.stack([fingertip.draw(1.5, friction=0.8, margin=margin) for margin in margins])
-    return fingertip.reference, frames
+    force, friction = np.array([1.5]), np.array([0.8])
+    films = [fingertip.film(force, friction=friction, margins=np.array([margin])) for margin in margins]
+    return fingertip.reference, np.concatenate([film.draw_all() for film in films])

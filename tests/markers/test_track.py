@@ -10,30 +10,23 @@ from sliplens.recordings.source import open_source
 KIND = {"chromatouch": "chromatouch", "flat-gel": "gelsight-mini"}
 
 
-def truth_of(tracks, rest):
-    """Which true marker each track began on."""
+def never_wrong(tracks, truth, rest):
+    """Followed markers lie where their own truth is; returns the marker of each track, and where it is well in view."""
     distance = np.linalg.norm(tracks.rest_px[:, None] - rest[None], axis=-1)
     assert np.all(distance.min(axis=1) < 1)
-    return distance.argmin(axis=1)
-
-
-def never_wrong(tracks, places):
-    """Followed markers lie where their own truth is; gives the share of markers followed."""
-    followed = tracks.followed
-    error = np.linalg.norm(tracks.position_px - places, axis=-1)
-    assert np.all(error[followed] < 1)
-    return followed.mean()
+    own = distance.argmin(axis=1)
+    places, (height, width) = truth[:, own], tracks.size
+    assert np.all(np.linalg.norm(tracks.position_px - places, axis=-1)[tracks.followed] < 1)
+    return own, np.all((places > 9) & (places < [width - 10, height - 10]), axis=-1)
 
 
 @pytest.mark.parametrize("name", ["chromatouch", "flat-gel"])
 def test_markers_are_followed_to_full_slip_and_back(name, trials):
     trial = trials[name]
     tracks = track_markers(trial.frames, trial.reference, KIND[name])
-    places = trial.truth.marker_px[:, truth_of(tracks, trial.truth.marker_rest_px)]
-    followed = tracks.followed
-    inside = np.all((places > 9) & (places < 214), axis=-1)
-    assert never_wrong(tracks, places) > 0.9
-    assert followed[inside].mean() > 0.995
+    _, inside = never_wrong(tracks, trial.truth.marker_px, trial.truth.marker_rest_px)
+    assert tracks.followed.mean() > 0.9
+    assert tracks.followed[inside].mean() > 0.995
 
 
 def test_a_marker_that_goes_is_missing_and_comes_back_as_itself(dots, grid, rng):
@@ -68,55 +61,45 @@ def test_a_marker_that_appears_is_left_out(dots, grid, rng):
 @pytest.mark.parametrize("jitter", [0.0, 0.5])
 def test_a_jump_of_more_than_half_a_pitch_is_never_matched_wrongly(pitches, jitter, dots, grid, rng):
     places = grid(jitter=jitter, rng=rng)
-    jump = np.array([26.0 * pitches, 0])
-    frames = [dots(places + jump + 0.2 * step) for step in range(4)]
-    tracks = track_markers(frames, dots(places), "gelsight-mini")
-    truth = np.stack([places + jump + 0.2 * step for step in range(4)])
-    never_wrong(tracks, truth[:, truth_of(tracks, places)])
+    truth = np.stack([places + np.array([26.0 * pitches, 0]) + 0.2 * step for step in range(4)])
+    never_wrong(track_markers(map(dots, truth), dots(places), "gelsight-mini"), truth, places)
 
 
 @pytest.mark.parametrize("pitches", [0.6, 0.8, 1.0])
 def test_a_printed_grid_that_fills_the_view_is_found_again_after_a_jump(pitches, dots, grid, rng):
     # it goes on beyond the view: only the print's small irregularities tell which marker is which
     places = grid(columns=12, rows=9, at=(-36.0, -32.0), jitter=0.5, rng=rng)
-    jump = np.array([26.0 * pitches, 0])
-    tracks = track_markers([dots(places), *[dots(places + jump)] * 2], dots(places), "gelsight-mini")
-    truth = np.stack([places, places + jump, places + jump])
-    mine = truth[:, truth_of(tracks, places)]
-    never_wrong(tracks, mine)
-    inside = np.all((mine > 8) & (mine < np.array([191, 151])), axis=-1)
+    truth = np.stack([places, *[places + np.array([26.0 * pitches, 0])] * 2])
+    tracks = track_markers(map(dots, truth), dots(places), "gelsight-mini")
+    _, inside = never_wrong(tracks, truth, places)
     assert tracks.followed[2][inside[2]].mean() > 0.95
 
 
 def shows_again(tracks, truth, shown):
-    """Markers that show again are followed within five frames under their own names, and none is ever wrong."""
-    own = truth_of(tracks, truth[0])
-    places, shown = truth[:, own], shown[:, own]
-    never_wrong(tracks, places)
-    inside = np.all((places > 9) & (places < np.array([190, 150])), axis=-1)
+    """Markers that show again are followed within five frames under their own names; returns where each is in view."""
+    own, inside = never_wrong(tracks, truth, truth[0])
+    shown = shown[:, own]
     again = shown[1:] & ~shown[:-1]
     assert again.any()
     for at, marker in np.argwhere(again):
         assert tracks.followed[at + 1 : at + 6, marker].any() or not inside[at + 1 : at + 6, marker].all()
+    return shown & inside
 
 
 @pytest.mark.parametrize("reach_px", [60, 110])
 def test_what_stands_plainly_is_followed_beside_a_heavy_object_from_the_border(reach_px, dots, grid, rng):
     rest = grid(columns=9, rows=7, pitch=22.0, at=(14.0, 14.0), jitter=0.5, rng=rng)
-    frames, truth, shown = [], [], []
+    course = []
     for depth in [0, 0.3, 0.7, 1, 1, 1, 0.5, 0, 0, 0, 0, 0]:
         edge = depth * reach_px  # of what lies on the gel, from the left
         places = rest + np.array([9.0, 0]) * depth * np.exp(-np.maximum(rest[:, :1] - edge, 0) / 40)
         seen = places[:, 0] > edge + 6
         frame = dots(places[seen], noise=1.0, rng=rng)
         frame[:, : int(edge)] = (70, 75, 80)
-        frames, truth, shown = [*frames, frame], [*truth, places], [*shown, seen]
+        course.append((frame, places, seen))
+    frames, truth, shown = map(np.array, zip(*course, strict=True))
     tracks = track_markers(frames, frames[0], "gelsight-mini")
-    truth, shown = np.array(truth), np.array(shown)
-    shows_again(tracks, truth, shown)
-    own = truth_of(tracks, rest)
-    inside = np.all((truth[:, own] > 9) & (truth[:, own] < np.array([190, 150])), axis=-1)
-    assert tracks.followed[shown[:, own] & inside].mean() > 0.95
+    assert tracks.followed[shows_again(tracks, truth, shown)].mean() > 0.95
 
 
 @pytest.mark.parametrize("pitches", [0.3, 1.6])

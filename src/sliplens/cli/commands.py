@@ -18,7 +18,7 @@ from sliplens.files import require_new_file, to_builtins
 from sliplens.progress import number_of, open_stage, reporting
 
 if TYPE_CHECKING:
-    from sliplens.grip.hold import HoldStep
+    from sliplens.grip.controllers import HoldStep
     from sliplens.live import LiveReader
 
 COMMANDS: dict[str, Command] = {}
@@ -507,7 +507,6 @@ class HoldOptions(TypedDict, total=False):
     "sliplens hold grip:cup --gripper simulated",
     ("settings", "--set"),
     ("ceiling_n", "--ceiling"),
-    ("watchdog_s", "--watchdog"),
 )
 def call_hold(call: Any, source: str, **options: Unpack[HoldOptions]) -> None:
     """Print the commands.

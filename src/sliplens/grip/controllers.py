@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields, replace
 from threading import Lock
 from typing import Protocol, TypeAlias, runtime_checkable
 
@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from sliplens.errors import InputError
 from sliplens.extras import Table
 from sliplens.grip.plant import PERIOD_S, Episodes
-from sliplens.live.reading import Reading, SlipState
+from sliplens.live.reading import Reading, SlipState, describe_reading
 
 _SETTLED_S = 1.0  # time until which the object is being lifted and no grip is loosened
 _START_N, _REFLEX_N, _ASSUMED_N = 2.0, 1.0, 1.5  # forces to lift with, of the margin law and the two others
@@ -111,12 +111,10 @@ class MarginLaw:
     """r_0 before any slip, a share: the prediction that is possible where the object already slides."""
     least_n: float = 0.5
     """Lowest force: with less the network sees no touch."""
-    acted: Episodes = field(init=False, repr=False, default_factory=lambda: np.ones(1))
+    # state, not constants: without a type it is no field
+    acted = np.ones(1)
     """Margin acted on last in each episode, a share."""
-    _zero: Episodes = field(init=False, repr=False, default_factory=lambda: np.zeros(1))
-    _last: Episodes = field(init=False, repr=False, default_factory=lambda: np.full(1, _NO_MARGIN))
-    _slipped_s: Episodes = field(init=False, repr=False, default_factory=lambda: np.full(1, -np.inf))
-    _margin_s: Episodes = field(init=False, repr=False, default_factory=lambda: np.zeros(1))
+    _zero, _last, _margin_s, _slipped_s = np.zeros(1), np.full(1, _NO_MARGIN), np.zeros(1), np.full(1, -np.inf)
 
     @property
     def aim(self) -> Episodes:
@@ -160,7 +158,7 @@ class MarginLaw:
 class Reflex:
     """F = const until a slip, then 1.5 times as much, again and again: markers alone, no margin."""
 
-    _slipped_s: Episodes = field(init=False, repr=False, default_factory=lambda: np.full(1, -np.inf))
+    _slipped_s = np.full(1, -np.inf)
 
     def command(self, observation: Observation, /) -> Episodes:
         """Return the grip force in newtons."""
@@ -199,9 +197,9 @@ _FRICTION_KNOWN = {"zero": 0.0, "target": 0.6}  # of margin laws: the prediction
 
 
 def make_controller(
-    name: str, settings: Mapping[str, float] | None = None, *, friction_known: bool = False
+    controller: str | Controller, settings: Mapping[str, float] | None = None, *, friction_known: bool = False
 ) -> Controller:
-    """Create a controller of `CONTROLLERS`.
+    """Create a controller of `CONTROLLERS`; another one is returned as it is.
 
     Examples
     --------
@@ -209,15 +207,19 @@ def make_controller(
     >>> make_controller("fixed", {"force_n": 1.5})
     FixedForce(force_n=1.5)
     """
-    kind, settings = CONTROLLERS.pick(name), dict(settings or {})
+    if not isinstance(controller, str):
+        if settings:
+            raise InputError("settings change a controller of the table; set those of your own where you make it")
+        return controller
+    kind, settings = CONTROLLERS.pick(controller), dict(settings or {})
     if friction_known and issubclass(kind, MarginLaw):
         settings = _FRICTION_KNOWN | settings
     constants = [item.name for item in fields(kind) if item.init]  # pyright: ignore[reportArgumentType]
     for constant, value in settings.items():
         if constant not in constants:
-            raise InputError(f"the controller {name} has no constant {constant!r}; choose of {', '.join(constants)}")
+            raise InputError(f"controller {controller} has no constant {constant!r}; choose of {', '.join(constants)}")
         if not np.isfinite(value) or value < 0:
-            raise InputError(f"{constant} of the controller {name} must be a number not below 0, got {value:g}")
+            raise InputError(f"{constant} of the controller {controller} must be a number not below 0, got {value:g}")
     if settings.get("target", 0) >= 1 or settings.get("zero", 0) >= 1:
         raise InputError("margins are shares of the friction: give a target and a zero below 1")
     return kind(**settings)
@@ -235,6 +237,7 @@ lag of 50 ms that closes on a soft object (17 N/s) reaches any command within 0.
 _LONGEST_S = 3 * PERIOD_S
 """Longest time that the force may change for at once: a late command does not make up for those before it."""
 _MEMORY = 240
+_TOO_OLD = {"margin": None, "low": None, "high": None, "withheld": "the newest margin is too old"}
 Values: TypeAlias = float | Float[np.ndarray, " contacts"]
 
 
@@ -259,8 +262,8 @@ class SlipGate:
 
 
 @dataclass(frozen=True, kw_only=True)
-class GripCommand:
-    """Grip force to command, and its reason."""
+class HoldStep:
+    """One command to a gripper, its reason, and the readings behind it."""
 
     command_n: float
     """Grip force to press with."""
@@ -271,8 +274,24 @@ class GripCommand:
     slip: bool
     """True where the markers showed a slip since the last command."""
     why: str
-    trouble: str | None = None
-    """Fault of the measured force; None while it follows the commands."""
+    trouble: str | None
+    """Fault of the gripper or its measured force; None while it follows the commands."""
+    time_s: float
+    """Time since the hold began."""
+    force_n: float
+    """Grip force that the gripper measured before; NaN without a measurement."""
+    readings: tuple[Reading | None, ...]
+    """Newest reading of each fingertip; None before the first."""
+
+    def __str__(self) -> str:
+        several = len(self.readings) > 1
+        words = [
+            (f"fingertip {number}: " if several else "") + str(describe_reading(reading))
+            for number, reading in enumerate(self.readings, start=1)
+            if reading is not None
+        ]
+        forces = f"{self.time_s:8.2f} s  {self.command_n:5.2f} N commanded, {self.force_n:5.2f} N measured"
+        return "; ".join([f"{forces}  {self.why}", *words])
 
 
 class Holder:
@@ -313,9 +332,7 @@ class Holder:
     def choose(self, controller: str | Controller) -> None:
         """Use another controller from now on."""
         self._chosen = controller
-        if isinstance(controller, str):
-            controller = make_controller(controller, self._settings, friction_known=self._friction_known)
-        self.controller = controller
+        self.controller = make_controller(controller, self._settings, friction_known=self._friction_known)
 
     def update_reading(self, reading: Reading, *, taken_s: float, finger: int = 0) -> None:
         """Take the reading of a frame that was taken at a time on the clock of the commands."""
@@ -341,8 +358,9 @@ class Holder:
             )
             self._readings[finger] = reading, taken_s
 
-    def grip_force(self, time_s: float, force_n: float, *, load_n: float = np.nan) -> GripCommand:
+    def grip_force(self, time_s: float, force_n: float, *, load_n: float = np.nan) -> HoldStep:
         """Return the grip force to command now, from the force measured now; NaN where none is measured."""
+        measured_n = force_n
         with self._lock:
             since_s = min(time_s - self._past[-1][0], _LONGEST_S) if self._past else PERIOD_S
             if self.touched_s is None and force_n > _TOUCH_N:
@@ -361,13 +379,18 @@ class Holder:
             )
             low, blind = np.where(np.isnan(low), margin, low), bool(np.isnan(margin).all())
             mean, lowest = (np.nan, np.nan) if blind else (float(np.nanmean(margin)), float(np.nanmean(low)))
+            readings = tuple(
+                item and (item[0] if new or item[0].margin is None else replace(item[0], **_TOO_OLD))
+                for item, new in zip(self._readings, fresh, strict=True)
+            )
             unmeasured = np.isnan(force_n) or (not blind and np.isnan(then_n))
+            reason = "no force is measured" if unmeasured else "the measured force does not follow the commands"
+            step = HoldStep(
+                command_n=self._command_n, margin=mean, low=lowest, slip=False, why=f"{reason}: holds", trouble=trouble,
+                time_s=time_s, force_n=measured_n, readings=readings,
+            )  # fmt: skip
             if unmeasured or trouble is not None:
-                reason = "no force is measured" if unmeasured else "the measured force does not follow the commands"
-                return GripCommand(
-                    command_n=self._command_n, margin=mean, low=lowest, slip=False, why=f"{reason}: holds",
-                    trouble=trouble,
-                )  # fmt: skip
+                return step
             slip, self._slip = self._slip, False
             observation = Observation(
                 time_s=0.0 if self.touched_s is None else time_s - self.touched_s,
@@ -388,7 +411,7 @@ class Holder:
             command_n = min(max(command_n, 0.0), self._ceiling_n)
             why = self._explain(command_n, slip=slip, blind=blind)
             self._command_n = command_n
-            return GripCommand(command_n=command_n, margin=mean, low=lowest, slip=slip, why=why)
+            return replace(step, command_n=command_n, slip=slip, why=why)
 
     def _compare(self, time_s: float, force_n: float) -> bool:
         """Return True where the measured force differs from the command; note a fault that lasts in `_trouble`."""

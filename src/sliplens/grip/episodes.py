@@ -8,26 +8,17 @@ from copy import deepcopy
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool
 
 from sliplens.codec import load_result, save_result
 from sliplens.errors import InputError
-from sliplens.extras import pick
 from sliplens.files import DEFAULT_NETWORK, output_folder, to_builtins
 from sliplens.friction import Friction, FrictionLike, SlipLearner, as_friction
 from sliplens.grip.controllers import SPRINGS_BACK_S, Controller, Observation, SlipGate, make_controller
-from sliplens.grip.fingertip import (
-    FingertipReading,
-    ReadingTable,
-    RenderedSensor,
-    TableSensor,
-    load_readings,
-    measure_readings,
-    require_calibration,
-)
+from sliplens.grip.fingertip import FingertipReading, RenderedSensor, TableSensor, load_readings
 from sliplens.grip.plant import (
     EPISODE_S,
     LATENCY_S,
@@ -46,10 +37,9 @@ from sliplens.grip.records import EpisodeTable, Grip, GripSetup, GripTrace
 from sliplens.live.slip import SlipBatch
 from sliplens.models import Network
 from sliplens.models.wrapping import open_run
-from sliplens.progress import OnProgress, add_note, number_of, open_stage, report_each, report_file, reporting
+from sliplens.progress import OnProgress, number_of, open_stage, report_each, report_file, reporting
 
 _BATCH = 500  # episodes stepped together: few enough for a processor's caches
-_MEASURED = 32  # fingertips by which the errors of a network without a table are measured
 _STILL_FRAMES = 30  # frames of the untouched fingertips before they close, for the noise of the markers
 _TICKS = round(EPISODE_S / PERIOD_S)
 _HANGS_S = LIFT_S + 0.1  # time from which the least force counts: the object hangs in the hand
@@ -126,14 +116,11 @@ def run_episodes(
     >>> bool(grip.episodes.dropped[0]), grip.episodes.mean_force_n.round(1)
     (False, array([3.]))
     """
-    pick(OBJECTS, object, noun="object")
-    if isinstance(controller, str):
-        make_controller(controller, settings)  # refused before anything is measured
-    elif settings:
-        raise InputError("settings are for the controllers of the table; set those of your own where you make it")
+    make_controller(controller, settings)  # refused before anything is measured
     scripts = draw_scripts(object, condition, episodes=episodes, seed=seed)
     network = open_run(network)
-    require_calibration(network)
+    if network.manifest.calibration is None:
+        raise InputError("the network was never calibrated and has no interval to grip by; train it with validation")
     frictions, words = list[Friction](), None
     if friction is not None:
         network.require_ratio()
@@ -153,71 +140,48 @@ def run_episodes(
         rendered=rendered,
         seed=seed,
     )
+    law = partial(make_controller, controller, settings)
+    run = partial(_run, setup, scripts, law=law, network=network, frictions=frictions)
     with reporting(on_progress):
-        table = None if rendered else load_readings(network)
-        if not rendered and table is None:
-            add_note("The network's errors on grips were not measured before: this takes minutes.")
-            with open_stage("Measuring readings"):
-                table = measure_readings(network, fingertips=_MEASURED)
-
-        run_batch = partial(
-            _run_batch, setup, scripts, controller=controller, network=network, table=table, frictions=frictions
-        )
-
-        def run(folder: Path | None) -> Grip:
-            """Run every batch, and write the record."""
-            begin, size, done = time.perf_counter(), 1 if rendered else _BATCH, list[Grip]()
-            chunks = [np.arange(first, min(first + size, episodes)) for first in range(0, episodes, size)]
-            with open_stage("Gripping"):
-                for number, rows in enumerate(report_each(chunks, sizes=list(map(len, chunks)))):
-                    done.append(run_batch(number, rows))
-            joined = EpisodeTable.joined([batch.episodes for batch in done])
-            grip = replace(done[0], seconds=time.perf_counter() - begin, episodes=joined)
-            if folder is not None:
-                save_result(grip, folder)
-            return grip
-
         if out is None:
-            return run(None)
+            return run()
         config = to_builtins(setup) | {"episodes": episodes}
         with output_folder(Path(out), stage="grip", config=config, overwrite=overwrite) as output:
-            complete = output.complete
-            grip = load_result(output.folder, Grip, command="sliplens grip") if complete else run(output.folder)
+            if output.complete:
+                grip = load_result(output.folder, Grip, command="sliplens grip")
+            else:
+                save_result(grip := run(), output.folder)
         summary = f"{number_of(len(grip.episodes), 'episode')}, {100 * grip.drop_rate:.1f} % dropped"
         report_file(Path(out), summary, kept=output.complete)
     return grip
 
 
-def _run_batch(
-    setup: GripSetup,
-    scripts: Scripts,
-    number: int,
-    rows: Int[np.ndarray, " episodes"],
-    *,
-    controller: str | Controller,
-    network: Network,
-    table: ReadingTable | None,
-    frictions: list[Friction],
+def _run(
+    setup: GripSetup, scripts: Scripts, *, law: partial[Controller], network: Network, frictions: list[Friction]
 ) -> Grip:
-    """Run some of the episodes; through pixels without a table."""
-    batch, learners = scripts.where(rows), [SlipLearner(frictions[row]) for row in rows if frictions]
-    seed = np.random.SeedSequence((setup.seed, number))
-    if table is None:
-        first, frames = int(seed.generate_state(1)[0]), 2 * _TICKS * len(scripts)
-        sensor = RenderedSensor(network, seed=first, frames=frames, learner=next(iter(learners), None))
-    else:
-        rng = np.random.default_rng(seed)
-        sensor = TableSensor(table, fingertips=batch.fingertips, rng=rng, learners=learners)
-    if isinstance(controller, str):
-        law = make_controller(controller, setup.settings, friction_known=bool(learners))
-    else:
-        law = deepcopy(controller)
-    loop, ticks = GripLoop(Plant(OBJECTS[setup.object], episodes=len(rows)), sensor, law), list[Tick]()
-    traced = setup.rendered or number == 0
-    done = run_scripts(loop, batch, condition=setup.condition, on_tick=ticks.append if traced else None)
-    if learners:
-        done = replace(done, known_friction=np.array([frictions[row].mean for row in rows]))
-    return Grip(setup=setup, seconds=0.0, episodes=done, trace=_trace(ticks))
+    """Run episodes in batches, by the measured errors of the network or through pixels."""
+    begin, size, count = time.perf_counter(), 1 if setup.rendered else _BATCH, len(scripts)
+    table = None if setup.rendered else load_readings(network)
+    ticks, done = list[Tick](), list[EpisodeTable]()
+    chunks = [np.arange(first, min(first + size, count)) for first in range(0, count, size)]
+    with open_stage("Gripping"):
+        for number, rows in enumerate(report_each(chunks, sizes=list(map(len, chunks)))):
+            batch, priors = scripts.where(rows), [frictions[row] for row in rows if frictions]
+            learners, seed = list(map(SlipLearner, priors)), np.random.SeedSequence((setup.seed, number))
+            if table is None:
+                first, frames = int(seed.generate_state(1)[0]), 2 * _TICKS * count
+                sensor = RenderedSensor(network, seed=first, frames=frames, learner=next(iter(learners), None))
+            else:
+                rng = np.random.default_rng(seed)
+                sensor = TableSensor(table, fingertips=batch.fingertips, rng=rng, learners=learners)
+            controller = deepcopy(law(friction_known=bool(priors)))
+            loop = GripLoop(Plant(OBJECTS[setup.object], episodes=len(rows)), sensor, controller)
+            rows_done = run_scripts(loop, batch, condition=setup.condition, on_tick=None if number else ticks.append)
+            if priors:
+                rows_done = replace(rows_done, known_friction=np.array([mu.mean for mu in priors]))
+            done.append(rows_done)
+    seconds = time.perf_counter() - begin
+    return Grip(setup=setup, seconds=seconds, episodes=EpisodeTable.joined(done), trace=_trace(ticks))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,18 +197,18 @@ class Tick:
     """Measurement before the step; the controller gets an earlier one."""
     slip: Bool[np.ndarray, " episodes"]
     """True where the controller receives slip events."""
+    least_n: Episodes
+    """Least force that holds in the step; 0 before the object hangs in the hand."""
+
+
+Sensor: TypeAlias = TableSensor | RenderedSensor
 
 
 class GripLoop:
     """Plant, fingertip sensor and controller in a loop of 60 Hz."""
 
     def __init__(
-        self,
-        plant: Plant,
-        sensor: TableSensor | RenderedSensor | None,
-        controller: Controller,
-        *,
-        latency_s: float = LATENCY_S,
+        self, plant: Plant, sensor: Sensor | None, controller: Controller, *, latency_s: float = LATENCY_S
     ) -> None:
         self.plant, self.sensor, self.controller = plant, sensor, controller
         delay = math.ceil(latency_s / PERIOD_S - 1e-9)
@@ -297,7 +261,8 @@ class GripLoop:
         )
         self._command_n = np.asarray(self.controller.command(observation), dtype=np.float64)
         state = self.plant.step(self._command_n, world)
-        return Tick(world=world, state=state, command_n=self._command_n, reading=reading, slip=slip)
+        least_n = least_force(world, time_s=now.time_s) * (now.time_s >= _HANGS_S - 1e-9)
+        return Tick(world=world, state=state, command_n=self._command_n, reading=reading, slip=slip, least_n=least_n)
 
 
 def run_scripts(
@@ -317,7 +282,7 @@ def run_scripts(
         if time_s >= _HANGS_S:
             on = holds * PERIOD_S
             force += on * tick.state.force_n
-            least += on * _least_force(tick)
+            least += on * tick.least_n
             lasted += on
             # the object slips when both fingers do: the margin of both frictions together
             whole = 1 - np.abs(tick.state.load_n) / np.maximum(tick.state.force_n * world.friction.sum(axis=1), 1e-9)
@@ -333,13 +298,6 @@ def run_scripts(
     )  # fmt: skip
 
 
-def _least_force(tick: Tick) -> Episodes:
-    """Compute the least force that holds in a step; 0 before the object hangs in the hand."""
-    begun_s = tick.state.time_s - PERIOD_S
-    least = least_force(tick.world, time_s=begun_s)
-    return least if begun_s >= _HANGS_S - 1e-9 else 0 * least
-
-
 def _trace(ticks: list[Tick]) -> GripTrace:
     """Trace the first episode; empty without ticks."""
     rows = []
@@ -347,7 +305,7 @@ def _trace(ticks: list[Tick]) -> GripTrace:
         state, valid = tick.state, np.isfinite(tick.reading.margin[0])
         predicted = [getattr(tick.reading, name)[0] for name in ("margin", "low", "high")]
         rows.append((
-            state.time_s, tick.command_n[0], state.force_n[0], _least_force(tick)[0], state.load_n[0],
+            state.time_s, tick.command_n[0], state.force_n[0], tick.least_n[0], state.load_n[0],
             np.nan_to_num(state.margin[0], nan=1.0).min(),
             *(values[valid].mean() if valid.any() else np.nan for values in predicted),
             state.slipped_m[0], tick.slip[0],

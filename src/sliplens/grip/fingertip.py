@@ -1,6 +1,6 @@
 """Simulated fingertips in any state of their contact: images, markers, and predictions of a network for them."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -8,6 +8,7 @@ from typing import Annotated, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
+from scipy.ndimage import map_coordinates
 from scipy.sparse import csr_array
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
@@ -16,11 +17,11 @@ from sliplens.codec import load_result
 from sliplens.errors import InputError
 from sliplens.files import find_run, shipped_names
 from sliplens.friction import SlipLearner
-from sliplens.grip.plant import Episodes, Fingers, PlantState
+from sliplens.grip.plant import OBJECTS, Episodes, Fingers, Plant, PlantState
 from sliplens.markers import Tracker
 from sliplens.models import Network, make_engine
 from sliplens.models.predictions import LEVEL
-from sliplens.progress import report_each
+from sliplens.progress import add_note, open_stage, report_each
 from sliplens.results.evaluation import ANSWER, MARGIN
 from sliplens.simulation.filming import Film, prepare_film, see_markers
 from sliplens.simulation.loading import load_at_margins, load_at_states
@@ -89,23 +90,16 @@ class Fingertip:
             film = replace(film, grasp=replace(grasp, shear_direction_rad=grasp.shear_direction_rad + np.pi))
         return film.under(loading, rng=self._rng)
 
-    def draw(
-        self, normal_force_n: float, *, friction: float, margin: float, held_s: float = 0.0, pulled_back: bool = False
-    ) -> UInt8[np.ndarray, "height width 3"]:
-        """Draw one frame of a state as in `film`; force in newtons, margin from 0 to 1."""
-        force, mu, gamma, time_s = (np.array([value]) for value in (normal_force_n, friction, margin, held_s))
-        film = self.film(force, friction=mu, margins=gamma, held_s=time_s, pulled_back=pulled_back)
-        return film.draw(slice(0, 1))[0].numpy()
-
-    def draw_state(self, state: PlantState, *, finger: int = 0) -> UInt8[np.ndarray, "height width 3"]:
+    def draw(self, state: PlantState, *, finger: int = 0) -> UInt8[np.ndarray, "height width 3"]:
         """Draw one frame of a finger of the first gripper of a plant."""
-        return self.draw(
-            float(state.force_n[0]),
-            friction=float(state.holding_friction[0, finger]),
-            margin=float(np.nan_to_num(state.margin[0, finger], nan=1.0)),
-            held_s=float(state.held_s[0]),
+        film = self.film(
+            state.force_n[:1],
+            friction=state.holding_friction[:1, finger],
+            margins=np.nan_to_num(state.margin[:1, finger], nan=1.0),
+            held_s=state.held_s[:1],
             pulled_back=bool(state.shear_n[0, finger] < 0),
         )
+        return film.draw_all()[0]
 
 
 class MarkerField:
@@ -133,8 +127,8 @@ class MarkerField:
         """Interpolate positions in pixels (x, y); at rest where nothing presses."""
         tips = 2 * grippers[:, None] + np.arange(2)
         touches = (normal_force_n > _TOUCH_N)[:, None]
-        force, part = (values[:, None] for values in place_in_grid(np.asarray(_FORCES_N), normal_force_n))
-        margin, share = place_in_grid(np.asarray(_MARGINS), margins)
+        force, part = _cell(_FORCES_N, normal_force_n[:, None])
+        margin, share = _cell(_MARGINS, margins)
         pull = np.where(pulled_back, -1, 1) * friction
         first, states = 2 * len(self.rest_px) * len(_FORCES_N), list[tuple[np.ndarray, np.ndarray]]()
         for upper, by_force in ((0, 1 - part), (1, part)):
@@ -147,6 +141,13 @@ class MarkerField:
         starts = np.arange(0, rows.size + 1, len(states))
         mix = csr_array((weights.ravel(), rows.ravel(), starts), shape=(tips.size, len(self._moved_px)))
         return self.rest_px[grippers] + (mix @ self._moved_px).reshape(*tips.shape, _MARKERS, 2)
+
+
+def _cell(grid: tuple[float, ...], values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the cell of a grid that each value lies in, and its position in it, 0 to 1."""
+    place = np.interp(values, grid, np.arange(len(grid)))
+    at = np.minimum(place.astype(int), len(grid) - 2)
+    return at, place - at
 
 
 _FORCES_N = (_TOUCH_N, 0.1, 0.3, 0.6, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
@@ -172,12 +173,6 @@ def _marker_grid(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     rest, press, shear = (np.stack(values) for values in zip(*parts, strict=True))
     # rounded as they were stored, in the type of all else: mixed types are slow
     return rest, press.astype(np.float32).astype(np.float64), shear.astype(np.float32).astype(np.float64)
-
-
-def place_in_grid(grid: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the cell of a grid that each value lies in, and its position in it, 0 to 1."""
-    at = np.clip(np.searchsorted(grid, values, side="right") - 1, 0, len(grid) - 2)
-    return at, np.clip((values - grid[at]) / (grid[at + 1] - grid[at]), 0, 1)
 
 
 FRICTIONS = (0.1, 0.18, 0.3, 0.5, 0.8, 1.3)
@@ -229,90 +224,70 @@ class ReadingTable:
         Mean and sigma of F_t / F_n follow, where the network predicts them. Forces and frictions outside the table
         count as the outermost.
         """
-        places = [
-            place_in_grid(np.log(FRICTIONS), np.log(np.maximum(friction, 1e-6))),
-            place_in_grid(np.log(FORCES_N), np.log(np.maximum(normal_force_n, 1e-6))),
-            place_in_grid(np.asarray(MARGINS), margins),
-        ]
-        stacked = self._stacked
-        total = np.zeros((*np.shape(fingertips), stacked.shape[-1]))
-        for corner in range(8):
-            weight, index = 1.0, [fingertips]
-            for axis, (at, part) in enumerate(places):
-                upper = corner >> axis & 1
-                weight = weight * (part if upper else 1 - part)
-                index.append(at + upper)
-            total += np.asarray(weight)[..., None] * stacked[tuple(index)]
-        return tuple(np.asarray(values) for values in np.moveaxis(total, -1, 0))
-
-    @cached_property
-    def _stacked(self) -> Float32[np.ndarray, "fingertips frictions forces margins values"]:
-        ratio = [self.ratio[name] for name in ("mean", "sigma") if self.ratio]
-        return np.stack([self.margin, self.low, self.high, *ratio], axis=-1)
+        steps = (np.log(FRICTIONS), np.log(FORCES_N), np.array(MARGINS))
+        values = (np.log(np.maximum(friction, 1e-6)), np.log(np.maximum(normal_force_n, 1e-6)), margins)
+        places = [np.interp(value, grid, np.arange(len(grid))) for value, grid in zip(values, steps, strict=True)]
+        tables = [self.margin, self.low, self.high, *(self.ratio[name] for name in ("mean", "sigma") if self.ratio)]
+        return tuple(map_coordinates(table, [fingertips, *places], output=np.float64, order=1) for table in tables)
 
 
-def require_calibration(run: Network) -> None:
-    """Refuse a network without intervals."""
-    if run.manifest.calibration is None:
-        raise InputError("the network was never calibrated and has no interval to grip by; train it with validation")
+_MEASURED = 32  # fingertips by which the errors of a network without a table are measured
 
 
-def measure_readings(run: Network, *, fingertips: int = 96, seed: int = 0, engine: str = "auto") -> ReadingTable:
-    """Measure the predictions of a network for fingertips at every friction, force and margin of the table.
+def _measure_readings(run: Network) -> ReadingTable:
+    """Measure the predictions of a calibrated network for fingertips at every friction, force and margin of the table.
 
     It takes some 2 s a fingertip on one core. The noise is that of 12 states of each fingertip, drawn twice.
     """
-    require_calibration(run)
     mu, force, gamma = np.meshgrid(FRICTIONS, FORCES_N, MARGINS, indexing="ij")
     # a fully stuck contact does not show the friction: one value is enough
     drawn = (gamma < 1) | (mu == FRICTIONS[0])
     count = int(drawn.sum())
-    again = np.random.default_rng(seed).choice(count, 12, replace=False)
-    ready = make_engine(engine, run, frames=fingertips * count)
-    tables: list[np.ndarray] = []
-    repeats: list[np.ndarray] = []
-    tip = None
-    for number in report_each(range(fingertips)):
-        tip = Fingertip(seed=seed + number, day=tip.day if tip is not None and number % 2 else None)
+    again = np.random.default_rng(0).choice(count, 12, replace=False)
+    engine = make_engine("auto", run, frames=_MEASURED * count)
+    tables, repeats, tip = list[np.ndarray](), list[np.ndarray](), None
+    for number in report_each(range(_MEASURED)):
+        tip = Fingertip(seed=number, day=tip.day if tip is not None and number % 2 else None)
         frames = []
         for rows in (np.arange(count), again):
             force_n, friction, margins = (values[drawn][rows] for values in (force, mu, gamma))
             film = tip.film(force_n, friction=friction, margins=margins, held_s=np.ones(len(rows)))
             frames.append(film.draw_all())
-        estimate = run.estimate(run.encode(np.concatenate(frames), tip.reference), engine=ready)
+        estimate = run.estimate(run.encode(np.concatenate(frames), tip.reference), engine=engine)
         ends = estimate.interval(LEVEL)
         assert ends is not None  # it is calibrated
         ratio = [] if estimate.ratio is None else [estimate.ratio.mean, estimate.ratio.sigma]
-        rows = [estimate.margin[:count], *(end[:count] for end in ends), *(values[:count] for values in ratio)]
-        table = np.empty((len(rows), *mu.shape), dtype=np.float32)
-        for row, values in zip(table, rows, strict=True):
-            row[drawn] = values
-            row[1:, :, -1] = row[0, :, -1]
+        values = np.stack([estimate.margin, *ends, *ratio])
+        table = np.empty((len(values), *mu.shape), dtype=np.float32)
+        table[:, drawn] = values[:, :count]
+        table[:, 1:, :, -1] = table[:, :1, :, -1]
         tables.append(table)
-        repeats.append(np.stack([values[count:] - values[:count][again] for values in (estimate.margin, *ratio[:1])]))
+        repeats.append(values[:, count:] - values[:, again])
     margin, low, high, *ratios = np.stack(tables, axis=1)
-    noise, *ratio_noise = (np.std(np.concatenate(repeats, axis=1), axis=1) / np.sqrt(2)).tolist()
+    noise = np.std(np.concatenate(repeats, axis=1), axis=1) / np.sqrt(2)
     return ReadingTable(
         network=run.manifest.weights_sha256,
-        seed=seed,
+        seed=0,
         margin=margin,
         low=low,
         high=high,
-        noise=noise,
+        noise=float(noise[0]),
         ratio=dict(zip(("mean", "sigma"), ratios, strict=False)),
-        ratio_noise=sum(ratio_noise),
+        ratio_noise=float(noise[3:4].sum()),
     )
 
 
-def load_readings(run: Network) -> ReadingTable | None:
-    """Load the table that comes with a network of the package; None for other weights."""
+def load_readings(run: Network) -> ReadingTable:
+    """Load the table that comes with a network of the package; other networks are measured (minutes)."""
     for name in shipped_names():
         folder = find_run(Path(name)) / "readings"
         if folder.is_dir():
             table = load_result(folder, ReadingTable, command="make weights")
             if table.network == run.manifest.weights_sha256:
                 return table
-    return None
+    add_note("The network's errors on grips were not measured before: this takes minutes.")
+    with open_stage("Measuring readings"):
+        return _measure_readings(run)
 
 
 Markers: TypeAlias = Float[np.ndarray, "_ _ 2"]
@@ -391,12 +366,9 @@ class TableSensor:
         places = self._field.at(
             self._gripper, state.force_n, friction=friction, margins=true, pulled_back=state.shear_n < 0
         )
-        return FingertipReading(
-            margin=np.where(pressing, margin, 1.0),
-            low=np.where(pressing, np.clip(low, 0, 1), 1.0),
-            high=np.where(pressing, np.clip(high, 0, 1), 1.0),
-            markers_px=self._follow(places),
-        )
+        parts = (margin, np.clip(low, 0, 1), np.clip(high, 0, 1))
+        margin, low, high = (np.where(pressing, values, 1.0) for values in parts)
+        return FingertipReading(margin=margin, low=low, high=high, markers_px=self._follow(places))
 
 
 def _margin_of_ratio(ratio: Fingers, sigma: Fingers, learners: Sequence[SlipLearner]) -> tuple[Fingers, ...]:
@@ -413,11 +385,7 @@ def _margin_of_ratio(ratio: Fingers, sigma: Fingers, learners: Sequence[SlipLear
 
 
 class RenderedSensor:
-    """Predictions of a network for drawn images of two fingertips, with their markers followed; for one episode.
-
-    While the network predicts one finger's frame, the other finger's markers are followed and frame is drawn, by one
-    thread each: threads that share many short steps wait for each other.
-    """
+    """Predictions of a network for drawn images of two fingertips, with their markers followed; for one episode."""
 
     def __init__(
         self,
@@ -437,31 +405,27 @@ class RenderedSensor:
 
     def still_markers(self, frames: int) -> Sequence[tuple[Markers, Markers]]:
         """Return the markers of both untouched fingertips: at rest, then as followed in some frames."""
+        untouched = Plant(OBJECTS["cup"]).state
         first, second = (
             [tracker.rest.centre_px[None]]
-            + [tracker.update(tip.draw(0.0, friction=1.0, margin=1.0)).position_px[None] for _ in range(frames)]
+            + [tracker.update(tip.draw(untouched)).position_px[None] for _ in range(frames)]
             for tip, tracker in zip(self.fingertips, self._trackers, strict=True)
         )
         return list(zip(first, second, strict=True))
 
     def measure(self, state: PlantState, slipping_s: Episodes) -> FingertipReading:
         """Draw both fingertips, predict their margins and follow their markers."""
-        markers_px: list[Markers] = []
-
-        def inputs() -> Iterator[Tensor]:
+        inputs, markers_px = list[Tensor](), list[Markers]()
+        with self._threads.limit(limits=1):  # threads that share many short steps wait for each other
             for finger, (tip, tracker) in enumerate(zip(self.fingertips, self._trackers, strict=True)):
-                with self._threads.limit(limits=1):
-                    frame = tip.draw_state(state, finger=finger)
-                    encoded = self._network.encode(frame[None], tip.reference)
-                yield encoded
-                with self._threads.limit(limits=1):
-                    markers_px.append(tracker.update(frame).position_px[None])
-
+                frame = tip.draw(state, finger=finger)
+                inputs.append(self._network.encode(frame[None], tip.reference))
+                markers_px.append(tracker.update(frame).position_px[None])
         friction, learner = None, self._learner
         if learner is not None:
             learner.update(state.time_s, slipping_s=None if np.isnan(slipping_s[0]) else float(slipping_s[0]))
             friction = learner.friction
-        estimate = self._network.estimate(inputs(), friction=friction, engine=self._engine)
+        estimate = self._network.estimate(inputs, friction=friction, engine=self._engine)
         if learner is not None and (ratio := estimate.ratio) is not None:
             learner.note(float(ratio.mean.mean()), sigma=float(ratio.sigma.mean()), time_s=state.time_s)
         low, high = estimate.interval(LEVEL) or (estimate.margin, estimate.margin)

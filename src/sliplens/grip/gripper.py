@@ -179,20 +179,8 @@ class RosGripper:
     """A gripper of ROS 2, by topics over Zenoh; its state is `sensor_msgs/msg/JointState` on `joint_states`.
 
     The joint's position is the width in metres and its effort the force in newtons. Topics confirm nothing: a gripper
-    without a valid state for `timeout_s` is a `GripperError` after each command, though the command was sent.
-
-    Parameters
-    ----------
-    key
-        Key of its topics, such as `gripper`, which ROS names `/gripper/command` and `/gripper/joint_states`.
-    address
-        Router or bridge to connect to.
-    messages
-        Row of `ROS_MESSAGES`.
-    joint
-        Joint of the gripper among those in its state; the first if None.
-    timeout_s
-        Largest age of a state, in seconds.
+    without a valid state for `timeout_s` is a `GripperError` after each command, though the command was sent. Topics
+    are below a key such as `gripper`, which ROS names `/gripper/command`. Parameters are those of `open_gripper`.
     """
 
     def __init__(
@@ -276,9 +264,11 @@ def open_gripper(
         `tcp://host:port`, or a serial device such as `/dev/ttyUSB0`, whose speed was set before (`stty`); for ROS 2
         `zenoh:KEY`, or `zenoh:KEY@tcp/HOST:PORT`, by `zenoh-bridge-ros2dds` or `rmw_zenohd`.
     timeout_s
-        Longest time until an answer, in seconds.
-    messages, joint
-        Of a gripper of ROS 2, as in `RosGripper`.
+        Longest time until an answer, and largest age of a state of ROS 2, in seconds.
+    messages
+        Messages that a gripper of ROS 2 takes, a row of `ROS_MESSAGES`.
+    joint
+        Joint of the gripper among those in its state; the first if None.
     """
     if address.startswith("zenoh:"):
         key, where = parse_zenoh(address.removeprefix("zenoh:"), purpose="zenoh")
@@ -317,20 +307,18 @@ def _open_serial(path: Path) -> FileIO:
 
 
 class DryRun:
-    """A gripper that does nothing and records all commands in `sent`."""
+    """A gripper that does nothing and records all forces, in newtons, in `sent`."""
 
     def __init__(self) -> None:
-        self.sent: list[str] = []
-        self._state = GripperState(force_n=0.0, width_m=0.0)
+        self.sent: list[float] = []
 
     def set_force(self, force_n: float) -> None:
         """Record a force in newtons."""
-        self.sent.append(f"F {force_n:.3f}")
-        self._state = GripperState(force_n=force_n, width_m=0.0)
+        self.sent.append(force_n)
 
     def read_state(self) -> GripperState:
         """Return the last force, with a width of 0."""
-        return self._state
+        return GripperState(force_n=self.sent[-1] if self.sent else 0.0, width_m=0.0)
 
     def close(self) -> None:
         """Do nothing."""
@@ -347,7 +335,7 @@ class GuardedGripper(AbstractContextManager["GuardedGripper"]):
         for name, value in (("ceiling", ceiling_n), ("watchdog", watchdog_s)):
             if not (math.isfinite(value) and value > 0):
                 raise InputError(f"the {name} of a guarded gripper must be positive and finite, got {value:g}")
-        self._gripper, self._ceiling, self._limit = gripper, ceiling_n, watchdog_s
+        self._gripper, self.ceiling_n, self._limit = gripper, ceiling_n, watchdog_s
         self._lock, self._stop = threading.Lock(), threading.Event()
         self._force: float | None = None
         self._command_s = time.monotonic()
@@ -367,7 +355,7 @@ class GuardedGripper(AbstractContextManager["GuardedGripper"]):
         with self._lock:
             self._command_s = time.monotonic()
             if not math.isnan(force_n):
-                self._force = min(max(force_n, 0.0), self._ceiling)
+                self._force = min(max(force_n, 0.0), self.ceiling_n)
             self._send()
 
     def read_state(self) -> GripperState:
@@ -389,10 +377,9 @@ class GuardedGripper(AbstractContextManager["GuardedGripper"]):
         self.close()
 
     def _send(self) -> None:
-        if self._force is None:
-            return
         try:
-            self._gripper.set_force(self._force)
+            if self._force is not None:
+                self._gripper.set_force(self._force)
             self.failure = None
         except Exception as error:  # whatever it was: without the watchdog nothing holds
             self.failure = str(error) or type(error).__name__

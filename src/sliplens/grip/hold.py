@@ -4,8 +4,9 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 from threading import Event
 
@@ -15,11 +16,10 @@ from sliplens.codec import save_result
 from sliplens.errors import InputError
 from sliplens.files import output_folder
 from sliplens.grip.controllers import (
-    STALE_S,
     AssumedFriction,
     Controller,
-    GripCommand,
     Holder,
+    HoldStep,
     MarginLaw,
     Oracle,
     make_controller,
@@ -30,39 +30,12 @@ from sliplens.grip.records import Ending, Hold, HoldSteps
 from sliplens.grip.source import GripSource
 from sliplens.live.contract import Pace
 from sliplens.live.loop import LiveReader
-from sliplens.live.reading import LiveFrame, Reading, describe_reading
+from sliplens.live.reading import LiveFrame, Reading
 
 _TRIES = 30  # for the first force, half a second: a driver may start late
 _STUCK_S, _STUCK_M = 2.0, 1e-4
 """Time in which a gripper without any force has to close by a tenth of a millimetre; the simulated one opens for 1.5 s
 first."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class HoldStep(GripCommand):
-    """One command to a gripper, and the readings behind it."""
-
-    time_s: float
-    """Time since the hold began."""
-    force_n: float
-    """Grip force that the gripper measured before; NaN without a measurement."""
-    readings: tuple[Reading | None, ...]
-    """Newest reading of each fingertip; None before the first."""
-
-    @property
-    def failed(self) -> bool:
-        """True where the gripper failed to take the command, or to measure its force."""
-        return self.trouble is not None
-
-    def __str__(self) -> str:
-        several = len(self.readings) > 1
-        words = [
-            (f"fingertip {number}: " if several else "") + str(describe_reading(reading))
-            for number, reading in enumerate(self.readings, start=1)
-            if reading is not None
-        ]
-        forces = f"{self.time_s:8.2f} s  {self.command_n:5.2f} N commanded, {self.force_n:5.2f} N measured"
-        return "; ".join([f"{forces}  {self.why}", *words])
 
 
 def hold_grip(
@@ -72,7 +45,6 @@ def hold_grip(
     controller: str | Controller = "margin",
     settings: Mapping[str, float] | None = None,
     ceiling_n: float = 4.0,
-    watchdog_s: float = 0.2,
     seconds: float | None = None,
     on_step: Callable[[HoldStep], None] | None = None,
     out: Path | str | None = None,
@@ -97,8 +69,6 @@ def hold_grip(
         Constants of a row to change, in its units (newtons, seconds, shares).
     ceiling_n
         Largest grip force.
-    watchdog_s
-        Time without a command after which the last force is repeated, in seconds.
     seconds
         Duration; with the source if None.
     on_step
@@ -133,10 +103,8 @@ def hold_grip(
     """
     if seconds is not None and not seconds > 0:
         raise InputError(f"seconds must be positive, got {seconds:g}")
-    if settings and not isinstance(controller, str):
-        raise InputError("settings change a controller of the table; set those of your own where you make it")
     readers = [readers] if isinstance(readers, LiveReader) else list(readers)
-    _require_fit(make_controller(controller, settings) if isinstance(controller, str) else controller, readers)
+    _require_fit(make_controller(controller, settings), readers)
     with ExitStack() as stack:
         address = gripper if isinstance(gripper, str) else type(gripper).__name__
         if gripper == "simulated":
@@ -153,31 +121,32 @@ def hold_grip(
         if out is not None:
             folder = output_folder(Path(out), stage="hold", config=recipe, overwrite=overwrite, resumable=False)
             output = stack.enter_context(folder)
-        guard = GuardedGripper(gripper, ceiling_n=ceiling_n, watchdog_s=watchdog_s)
+        guard = GuardedGripper(gripper, ceiling_n=ceiling_n)
         stack.callback(guard.stop)
-        loop = HoldLoop(guard, readers, controller, settings=settings, ceiling_n=ceiling_n)
+        loop = HoldLoop(guard, readers, controller, settings)
         for finger, reader in enumerate(readers):
             stack.callback(reader.subscribe(partial(loop.update_reading, finger)))
-        ended, why = loop.run(seconds, on_step)
+        ended, why = loop.run(seconds, on_step or (lambda _: None))
         last = "the gripper got no command"
         if loop.steps:
             last = f"the gripper keeps the last command of {loop.steps[-1].command_n:.2f} N"
-        kinds = {"slip": bool, "failed": bool, "why": str}
-        columns = {
-            name: np.array([getattr(step, name) for step in loop.steps], dtype=kinds.get(name, np.float64))
-            for name in HoldSteps.__dataclass_fields__
-        }
+        names = ("time_s", "command_n", "force_n", "margin", "low")
+        numbers = {name: np.array([getattr(step, name) for step in loop.steps], dtype=float) for name in names}
         hold = Hold(
             sources=tuple(reader.source.name for reader in readers),
             gripper=address,
             controller=name,
             settings=dict(settings or {}),
             ceiling_n=ceiling_n,
-            watchdog_s=watchdog_s,
             ended=ended,
             why=f"{why}; {'nothing was sent' if address == 'dry-run' else last}",
             troubles=tuple(loop.troubles),
-            steps=HoldSteps(**columns),
+            steps=HoldSteps(
+                **numbers,
+                slip=np.array([step.slip for step in loop.steps], dtype=bool),
+                failed=np.array([step.trouble is not None for step in loop.steps], dtype=bool),
+                why=np.array([step.why for step in loop.steps], dtype=str),
+            ),
         )
         if output is not None:
             save_result(hold, output.folder)
@@ -194,12 +163,9 @@ class HoldLoop:
         guard: GuardedGripper,
         readers: Sequence[LiveReader],
         controller: str | Controller,
-        *,
         settings: Mapping[str, float] | None = None,
-        ceiling_n: float,
     ) -> None:
         self._guard, self._readers = guard, readers
-        self._readings: list[Reading | None] = [None] * len(readers)
         self.steps: list[HoldStep] = []
         self.troubles: dict[str, None] = {}
         """Faults of the gripper, in the order in which they first came."""
@@ -210,42 +176,34 @@ class HoldLoop:
         self._holder = Holder(
             controller,
             settings=settings,
-            ceiling_n=ceiling_n,
-            command_n=min(force_n, ceiling_n) if force_n > 0 else 0.0,  # what is held already stays held
+            ceiling_n=guard.ceiling_n,
+            command_n=min(max(force_n, 0.0), guard.ceiling_n),  # what is held already stays held
             fingers=len(readers),
         )
 
     def update_reading(self, finger: int, reading: Reading, _: LiveFrame | None) -> None:
         """Take a reading, in the thread of its reader."""
-        self._readings[finger] = reading
         self._holder.update_reading(reading, taken_s=reading.captured_s, finger=finger)
 
-    def run(self, seconds: float | None, on_step: Callable[[HoldStep], None] | None) -> tuple[Ending, str]:
+    def run(self, seconds: float | None, on_step: Callable[[HoldStep], object]) -> tuple[Ending, str]:
         """Hold until the end; returns its kind and reason. What a gripper or callback raises is in `error`."""
-        begun_s = time.monotonic()
-        pace, number = Pace(Event()), 0
+        begun_s, pace = time.monotonic(), Pace(Event())
         self.error: Exception | None = None
         try:
-            while pace.wait(number * PERIOD_S):
-                number += 1
+            for number in count():
+                pace.wait(number * PERIOD_S)
                 ends = [reader.ended for reader in self._readers]
                 if None not in ends:
                     failed = any(reader.failed for reader in self._readers)
                     return "failed" if failed else "source", ", ".join(map(str, ends))
                 if seconds is not None and time.monotonic() - begun_s >= seconds:
                     break
-                step = self.step(begun_s)
-                if on_step is not None:
-                    try:
-                        on_step(step)
-                    except Exception as error:  # whatever a callback raises: the result is saved first
-                        self.error = error
-                        return "failed", f"on_step failed ({error or type(error).__name__})"
+                on_step(self.step(begun_s))
         except KeyboardInterrupt:
             return "interrupted", "interrupted"
-        except GripperError as error:
+        except Exception as error:  # whatever a callback raises: the result is saved first
             self.error = error
-            return "failed", str(error)
+            return "failed", str(error) if isinstance(error, GripperError) else f"{type(error).__name__} ({error})"
         return "time", "the time is over"
 
     def step(self, begun_s: float) -> HoldStep:
@@ -260,17 +218,7 @@ class HoldLoop:
             trouble = self._guard.failure or trouble or decision.trouble
             if trouble is not None:
                 self.troubles[trouble] = None
-            step = HoldStep(
-                **vars(replace(decision, trouble=trouble)),
-                time_s=now_s - begun_s,
-                force_n=state.force_n,
-                readings=tuple(
-                    replace(reading, margin=None, low=None, high=None, withheld="the newest margin is too old")
-                    if reading is not None and reading.margin is not None and now_s - reading.captured_s > STALE_S
-                    else reading
-                    for reading in self._readings
-                ),
-            )
+            step = replace(decision, time_s=now_s - begun_s, trouble=trouble)
             self.steps.append(replace(step, readings=()))
         return step
 

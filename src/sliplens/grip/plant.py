@@ -183,15 +183,11 @@ class Plant:
             held_s=np.where(force > 0, old.held_s + duration_s, 0.0),
             dropped=old.dropped | (slip.max(axis=1) > self.gripped.grip_length_m), crushed=crushed,
         )  # fmt: skip
-        if old.dropped.any():
-            fallen = {
-                name: np.where(old.dropped if before.ndim == 1 else old.dropped[:, None], before, getattr(new, name))
-                for name, before in vars(old).items()
-                if name != "time_s"
-            }
-            new = replace(new, **fallen)
-        self.state = new
-        return new
+        arrays = {name: before for name, before in vars(old).items() if name != "time_s"}
+        dropped = {1: old.dropped, 2: old.dropped[:, None]}
+        kept = {name: np.where(dropped[before.ndim], before, getattr(new, name)) for name, before in arrays.items()}
+        self.state = replace(new, **kept)
+        return self.state
 
 
 def least_force(world: World, *, time_s: float) -> Episodes:

@@ -125,7 +125,6 @@ class Hold(Result):
     settings: dict[str, float]
     """Changed constants of the controller."""
     ceiling_n: float
-    watchdog_s: float
     ended: Ending
     """`time`: the time was over; `source`: a source ended; `failed`: a source or callback failed; `interrupted`: by a
     person."""

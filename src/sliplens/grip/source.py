@@ -143,7 +143,7 @@ class GripSource(LiveSource):
                 self._frames.pop(number - _MEMORY, None)
             force_n, margin = float(state.force_n[0]), float(state.margin[0, 0])
             yield LiveFrame(
-                image=self._tip.draw_state(state),
+                image=self._tip.draw(state),
                 number=number,
                 time_s=time_s,
                 captured_s=captured_s,

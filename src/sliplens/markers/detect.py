@@ -18,7 +18,6 @@ Contrast: TypeAlias = Literal["dark", "light", "colour"]
 class MarkerKind:
     """Look of a sensor's markers against their background."""
 
-    name: str
     contrasts: tuple[Contrast, ...]
     """Possible contrasts; where there are several, the frame decides."""
     radius_px: tuple[float, float] = (2.0, 40.0)
@@ -40,15 +39,11 @@ class Appearance:
 
 
 KINDS = {
-    "chromatouch": MarkerKind(
-        name="chromatouch",
-        contrasts=("dark",),
-        # red speckles most, and the lamps' glare is blue: green measures best
-        channels=(0.2, 0.8, 0.0),
-    ),
-    "gelsight-mini": MarkerKind(name="gelsight-mini", contrasts=("dark",), channels=(1.0, 1.0, 1.0)),
-    "tactip": MarkerKind(name="tactip", contrasts=("light",), channels=(1.0, 1.0, 1.0)),
-    "auto": MarkerKind(name="auto", contrasts=("dark", "light", "colour")),
+    # red speckles most, and the lamps' glare is blue: green measures best
+    "chromatouch": MarkerKind(contrasts=("dark",), channels=(0.2, 0.8, 0.0)),
+    "gelsight-mini": MarkerKind(contrasts=("dark",), channels=(1.0, 1.0, 1.0)),
+    "tactip": MarkerKind(contrasts=("light",), channels=(1.0, 1.0, 1.0)),
+    "auto": MarkerKind(contrasts=("dark", "light", "colour")),
 }
 """Presets by name: the magenta dots of the ChromaTouch, the black ones of a GelSight Mini, the white pins of a TacTip;
 `auto` looks for whatever is round and stands out alike in many places."""
@@ -71,8 +66,8 @@ def find_appearance(frame: UInt8[np.ndarray, "height width 3"], kind: MarkerKind
     tries = [look for contrast in kind.contrasts if (look := _find_spots(frame, kind, contrast))]
     if not tries:
         raise ImageError(
-            f"fewer than {FEWEST} markers of kind {kind.name} were found in a frame of {frame.shape[0]} x "
-            f"{frame.shape[1]} pixels; choose another kind, or use a frame that shows the markers"
+            f"fewer than {FEWEST} markers were found in a frame of {frame.shape[0]} x {frame.shape[1]} pixels; choose "
+            "another kind of markers, or use a frame that shows them"
         )
     return max(tries, key=lambda look: look[0])[1]
 

@@ -1,6 +1,6 @@
 """Detection of the gel and the markers in a camera's frames, and the sensor profile that follows."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 from sliplens.codec import Result
 from sliplens.errors import ImageError, InputError
 from sliplens.extras import import_cv2
-from sliplens.markers.detect import FEWEST, Appearance, MarkerKind, detect_markers
+from sliplens.markers.detect import FEWEST, KINDS, Appearance, detect_markers
 from sliplens.recordings.capture import Frame
 from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.source import Frames, open_source
@@ -101,8 +101,6 @@ def propose_profile(
     else:
         notes.append("no markers were found; set their kind in `markers` if there are any")
     crop = gel if size_px is None else _shaped(gel, size_px, (width, height))
-    if crop is None:
-        raise InputError(f"a gel of {gel[2]} x {gel[3]} pixels is too small; move the camera nearer")
     factor = 1.0 if size_px is None else size_px[0] / crop[2]
     notes += [
         f"frame {untouched} is taken as the untouched sensor; change reference_frame if it was touched then",
@@ -150,7 +148,7 @@ def _find_markers(
     x, y, across, down = lit
     part = frame[y : y + down, x : x + across]
     low = max(2.0, min(across, down) / _SMALL_SHARE)
-    sized = MarkerKind(name="auto", contrasts=("dark", "light", "colour"), radius_px=(low, max(40.0, low + 1)))
+    sized = replace(KINDS["auto"], radius_px=(low, max(40.0, low + 1)))
     nothing = None, np.empty((0, 2)), np.nan
     try:
         markers = detect_markers(part, sized)
@@ -180,12 +178,12 @@ def _kind(part: Frame, centres: Float[np.ndarray, "markers 2"], look: Appearance
 
 def _shaped(
     gel: tuple[int, int, int, int], size_px: tuple[int, int], frame: tuple[int, int]
-) -> tuple[int, int, int, int] | None:
-    """Fit a box of a shape about the middle of the gel into the frame; None where it is too small."""
+) -> tuple[int, int, int, int]:
+    """Fit a box of a shape about the middle of the gel into the frame."""
     shape = size_px[0] / size_px[1]
     across = min(max(gel[2], gel[3] * shape), frame[0], frame[1] * shape)
     width, height = round(across), round(across / shape)
     if min(width, height) < 8:
-        return None
+        raise InputError(f"a gel of {gel[2]} x {gel[3]} pixels is too small; move the camera nearer")
     x, y = round(gel[0] + (gel[2] - width) / 2), round(gel[1] + (gel[3] - height) / 2)
     return min(max(x, 0), frame[0] - width), min(max(y, 0), frame[1] - height), width, height

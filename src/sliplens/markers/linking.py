@@ -67,7 +67,7 @@ class Pattern:
         self._offset = (place_px[self._near] - place_px[:, None]) / self._pitch[:, None, None]
         # mostly the same markers are usable frame after frame
         self._weights = lru_cache(maxsize=16)(self._fit)
-        self._spread_px, self._support = np.inf, 1.0
+        self._usual = np.array([np.inf, 1.0])
         """Usual spread and support of a pairing."""
 
     def _fit(self, usable: bytes) -> Float[np.ndarray, "markers neighbours"]:
@@ -103,9 +103,8 @@ class Pattern:
         stands = [step, *(self._pair_twice(origin, np.zeros(2), spots_px) for origin in origins[1:])]
         shifts = [(origin, shift) for origin in origins for shift in likely_shifts(origin, spots_px, pitch_px=pitch)]
         tried = [*stands, *(self._pair_twice(origin, shift, spots_px) for origin, shift in shifts)]
-        count = len(self._rest)
-        rivals = [match for match in tried if match.support >= _LEAST_SUPPORT]
-        rivals = [match for match in rivals if match.paired.sum() >= _LEAST_SHARE * count]
+        least, most = _LEAST_SHARE * len(self._rest), _MOST_SHARE * len(self._rest)
+        rivals = [match for match in tried if match.support >= _LEAST_SUPPORT and match.paired.sum() >= least]
         # first a pattern that hardly moved, or stands at rest again, however many markers are hidden or dragged along
         for match in stands:
             moved = np.linalg.norm(match.step_px[match.paired], axis=1) / self._pitch[match.paired]
@@ -117,7 +116,7 @@ class Pattern:
         rivals = [
             match
             for match in rivals
-            if match.paired.sum() >= _MOST_SHARE * count or _stands_out(match, tried, share=_MOVING_SHARE, rivals=0.5)
+            if match.paired.sum() >= most or _stands_out(match, tried, share=_MOVING_SHARE, rivals=0.5)
         ]
         if not rivals:
             return None
@@ -131,19 +130,18 @@ class Pattern:
 
     def note(self, pairing: Pairing | None) -> None:
         """Update the usual spread and support by a pairing that was accepted."""
-        if pairing is None:
-            return
-        spread, first = max(pairing.spread_px, _LEAST_SPREAD_PX / _CALM_SPREAD), not np.isfinite(self._spread_px)
-        self._spread_px = spread if first else 0.8 * self._spread_px + 0.2 * spread
-        self._support = pairing.support if first else 0.8 * self._support + 0.2 * pairing.support
+        if pairing is not None:
+            new = np.array([max(pairing.spread_px, _LEAST_SPREAD_PX / _CALM_SPREAD), pairing.support])
+            self._usual = 0.8 * self._usual + 0.2 * new if np.isfinite(self._usual[0]) else new
 
     def _is_calm(self, step: Pairing) -> bool:
         moved = np.linalg.norm(step.step_px, axis=1) / self._pitch
-        # the first step has no mean to be compared with
-        spread = self._spread_px if np.isfinite(self._spread_px) else 0.02 * float(np.median(self._pitch))
-        smooth = step.spread_px <= max(_CALM_SPREAD * spread, _LEAST_SPREAD_PX)
+        spread_px, support = self._usual.tolist()
+        if not np.isfinite(spread_px):  # the first step has no mean to be compared with
+            spread_px = 0.02 * float(np.median(self._pitch))
+        smooth = step.spread_px <= max(_CALM_SPREAD * spread_px, _LEAST_SPREAD_PX)
         small = bool(step.paired.any()) and float(np.nanmedian(moved)) <= _CALM_STEP
-        return small and smooth and step.support >= _CALM_SUPPORT * self._support
+        return small and smooth and step.support >= _CALM_SUPPORT * support
 
     def _pair_twice(self, origin_px: Places, shift_px: Float[np.ndarray, "2"], spots_px: Spots) -> Pairing:
         """Pair markers and spots nearest to each other after a common shift, then again after the neighbours' steps.

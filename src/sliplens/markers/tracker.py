@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from sliplens.errors import ImageError, RecordingError
 from sliplens.markers.detect import MarkerKind, Markers, detect_markers, measure_markers
-from sliplens.markers.linking import Pairing, Pattern, Places
+from sliplens.markers.linking import Pairing, Pattern
 
 _RADIUS_CHANGE = (0.6, 1.6)  # of the radius at rest, over the median change of all markers
 _CONTRAST_LEFT = 0.45
@@ -70,6 +70,11 @@ class Tracker:
         self._pattern = Pattern(self.rest.centre_px, size=self._size)
         self._shift, self._lost = np.zeros_like(self.rest.centre_px), False
         self._followed, self._since_whole = np.zeros(len(self.rest), dtype=bool), _WHOLE_EVERY
+        place, unknown = self.rest.centre_px, np.full(len(self.rest), np.nan)
+        self._unidentified = Tracks(
+            rest_px=place, position_px=np.full_like(place, np.nan), size=self._size, radius_px=unknown,
+            deviation_px=unknown, status=np.full(len(place), MarkerStatus.LOST, dtype=np.uint8),
+        )  # fmt: skip
 
     def update(self, frame: UInt8[np.ndarray, "_ _ 3"]) -> Tracks:
         """Follow the markers into the next frame T_n, of the reference's size.
@@ -82,20 +87,19 @@ class Tracker:
                 f"frame of {frame.shape[0]} x {frame.shape[1]} pixels against a reference of {self._size[0]} x "
                 f"{self._size[1]}; record the reference with the same camera settings"
             )
-        rest, count = self.rest.centre_px, len(self.rest)
+        rest = self.rest.centre_px
         detected, pairing = self._measure_near(frame) or self._search(frame)
         self._lost = pairing is None
         if pairing is None:
             self._since_whole = _WHOLE_EVERY
-            place = np.full((count, 2), np.nan)
-            return self._tracked(place, place[:, 0], place[:, 0], np.full(count, MarkerStatus.LOST, dtype=np.uint8))
+            return self._unidentified
         spot = pairing.spot
         shift, changed, cut, sound, predicted = self._select_sound(detected, spot)
         if not sound.all():
             certain = sound | changed | cut
             spot = self._pattern.match_left_over(spot, certain, predicted, detected.centre_px)
             shift, _, cut, sound, predicted = self._select_sound(detected, spot)
-        status = np.full(count, MarkerStatus.MISSING, dtype=np.uint8)
+        status = np.full(len(rest), MarkerStatus.MISSING, dtype=np.uint8)
         status[spot >= 0] = MarkerStatus.BROKEN
         status[sound], self._followed = MarkerStatus.FOLLOWED, sound
         # undetected markers move on with their neighbours, so that they are identified when they come back
@@ -107,7 +111,7 @@ class Tracker:
         place, deviation = rest + shift, np.linalg.norm(shift - predicted, axis=1)
         radius = _at_spots(detected.radius_px, spot)
         place[hidden], radius[hidden], deviation[hidden] = np.nan, np.nan, np.nan
-        return self._tracked(place, radius, deviation, status)
+        return replace(self._unidentified, position_px=place, radius_px=radius, deviation_px=deviation, status=status)
 
     def _measure_near(self, frame: UInt8[np.ndarray, "_ _ 3"]) -> tuple[Markers, Pairing] | None:
         """Measure the markers around their last places; None where the whole frame must be searched."""
@@ -131,12 +135,6 @@ class Tracker:
         pairing = self._pattern.link(origins, detected.centre_px, lost=self._lost)
         self._pattern.note(pairing)
         return detected, pairing
-
-    def _tracked(self, place: Places, radius: np.ndarray, deviation: np.ndarray, status: np.ndarray) -> Tracks:
-        rest = self.rest.centre_px
-        return Tracks(
-            rest_px=rest, position_px=place, size=self._size, radius_px=radius, deviation_px=deviation, status=status
-        )
 
     def _select_sound(self, detected: Markers, spot: Int[np.ndarray, " markers"]) -> tuple[np.ndarray, ...]:
         """Compare markers with their spots and neighbours."""

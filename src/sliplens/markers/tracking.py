@@ -210,15 +210,13 @@ class _Following(Work):
 
 def _outcome(rows: pa.Table) -> TrialTracking:
     """Summarise a trial from its rows."""
-    frame = rows["frame"].to_numpy()
-    status = rows["status"].combine_chunks().indices.to_numpy()
-    frames, markers = int(frame[-1]) + 1, int((frame == 0).sum())
+    markers = int((rows["frame"].to_numpy() == 0).sum())
+    status = rows["status"].combine_chunks().indices.to_numpy().reshape(-1, markers)
     followed, in_view = status == MarkerStatus.FOLLOWED, status != MarkerStatus.OUTSIDE
-    lost = np.bincount(frame[status == MarkerStatus.LOST], minlength=frames)
     return TrialTracking(
         trial=rows["trial"][0].as_py(),
-        frames=frames,
+        frames=len(status),
         markers=markers,
         followed_share=int(followed.sum()) / max(1, int(in_view.sum())),
-        lost_frames=int((lost == markers).sum()),
+        lost_frames=int((status == MarkerStatus.LOST).all(axis=1).sum()),
     )

@@ -10,7 +10,7 @@ from jaxtyping import Float, Float32, Int, UInt8
 from torch import Tensor
 
 from sliplens.mechanics import normal_slope
-from sliplens.simulation.loading import Loading, Motion, move_markers
+from sliplens.simulation.loading import Loading, Motion, load_at_margins, move_markers
 from sliplens.simulation.nuisances import Day, Grasp, Nuisances, Unit
 from sliplens.simulation.sensor import Point, Rays, Sensor, mix_noise, pick_noise, pixel_grid
 
@@ -57,32 +57,23 @@ class Film:
 
     def untouched(self) -> "Film":
         """Return a film of the reference frame alone."""
-        markers, first = len(self.marker_rest_px), np.zeros(2, dtype=int)
-        nothing = dict.fromkeys(("touch", "indentation_m", "contact_radius_m", "stick_radius_m"), np.zeros(1))
-        motion = replace(
-            self.motion,
-            centres_px=self.motion.rest_px[None],
-            scale=np.ones((1, markers)),
-            pressure=np.zeros((1, markers)),
-            **nothing,
-        )
-        picks, blur_px = self.noise_picks[first], self.blur_px[first]
-        return replace(self, motion=motion, marker_px=self.marker_rest_px[None], blur_px=blur_px, noise_picks=picks)
+        first, nothing = np.zeros(2, dtype=int), load_at_margins(np.full(1, np.nan), grasp=self.grasp)
+        return self._loaded(nothing, blur_px=self.blur_px[first], noise_picks=self.noise_picks[first])
 
     def under(self, loading: Loading, *, rng: np.random.Generator) -> "Film":
         """Return a film of another loading of the same grasp, by the same camera on the same day, with new noise.
 
         The markers move by the sensor's default model; the grasp's offset, direction and haze stay.
         """
-        motion, _, marker_px = see_markers(self.sensor, loading=loading, grasp=self.grasp, day=self.day, unit=self.unit)
         frames = len(loading.time_s)
-        return replace(
-            self,
-            motion=motion,
-            marker_px=marker_px,
-            blur_px=np.append(self.blur_px[:1], np.full(frames, self.grasp.blur_px)),
-            noise_picks=np.concatenate([self.noise_picks[:1], pick_noise(frames, rng=rng)]),
+        blur_px = np.append(self.blur_px[:1], np.full(frames, self.grasp.blur_px))
+        return self._loaded(
+            loading, blur_px=blur_px, noise_picks=np.concatenate([self.noise_picks[:1], pick_noise(frames, rng=rng)])
         )
+
+    def _loaded(self, loading: Loading, **drawn: np.ndarray) -> "Film":
+        motion, _, marker_px = see_markers(self.sensor, loading=loading, grasp=self.grasp, day=self.day, unit=self.unit)
+        return replace(self, motion=motion, marker_px=marker_px, **drawn)
 
     def draw_reference(self) -> UInt8[Tensor, "height width 3"]:
         """Draw the untouched sensor."""
@@ -216,8 +207,7 @@ def prepare_film(
     )
     geometry, frames = sensor.geometry, len(loading.time_s)
     middle = np.asarray(geometry.centre_px)
-    see = partial(_see, centre_px=middle, day=day)
-    contact_px = see(geometry.project(geometry.skin_point(motion.contact_centre_m)))
+    contact_px = _see(geometry.project(geometry.skin_point(motion.contact_centre_m)), centre_px=middle, day=day)
     edge, apex = (geometry.project(geometry.skin_point(np.array([x, 0.0]))) for x in (motion.nominal_radius_m, 0.0))
     light, grain = brightness(sensor, day=day), np.random.default_rng((unit.texture_seed, 1))
     print_shape = (3, geometry.markers, _PATCH, _PATCH)

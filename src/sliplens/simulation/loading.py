@@ -36,13 +36,15 @@ class ContactFriction:
     slips: Bool[np.ndarray, " frames"]
 
 
-def slide(since_slip_s: Frames, *, static_friction: Frames, grasp: Grasp, stuck_until: int) -> ContactFriction:
-    """Compute the friction of a sliding contact: a fall from static to kinetic, then stick-slip of a spring-slider.
+def slide(
+    since_slip_s: Frames, *, used: Frames, static_friction: Frames, grasp: Grasp, stuck_until: int
+) -> ContactFriction:
+    """Compute the friction of a contact that slides: a fall from static to kinetic, then stick-slip of a spring-slider.
 
     The spring reloads the stuck contact at a steady rate from kinetic friction to what the contact regained in that
     short time (a share of static less kinetic: friction ages), then the contact slips back. With a share of 0 it slides
-    on evenly. Frames before the first slip are meaningless. From `stuck_until` frames after it the contact is let go:
-    it slips for good, at its level of that moment.
+    on evenly. Before the first slip the contact uses the share `used` of the static friction. From `stuck_until` frames
+    after it the contact is let go: it slips for good, at its level of that moment.
 
     Persson, *Sliding Friction* (2000), chapter 3 (spring-slider, stick-slip).
     """
@@ -66,7 +68,13 @@ def slide(since_slip_s: Frames, *, static_friction: Frames, grasp: Grasp, stuck_
             level[first - 1] / static_friction[first - 1] * (static_friction[first:])
         )
         stuck[first:] = False
-    return ContactFriction(coefficient=friction, used=level / friction, carried=carried, slips=~stuck)
+    before = since_slip_s < 0
+    return ContactFriction(
+        coefficient=np.where(before, static_friction, friction),
+        used=np.where(before, used, level / friction),
+        carried=np.where(before, 0.0, carried),
+        slips=~(before | stuck),
+    )
 
 
 TRIAL_S = 8.0
@@ -147,27 +155,23 @@ def draw_pull(*, progress: Frames, duration_s: float, rng: np.random.Generator) 
     """
     events = rng.choice(["rest", "jerk", "let back"], size=rng.integers(_MOST_EVENTS + 1))
     places = np.append(np.sort(rng.uniform(0.05, 0.95, len(events))), 1.0)
-    # time and level of each corner; times are weights at first, except those of jerks
-    weights, jerks, levels, backs = [0.0], [0.0], [0.0], []
-
-    def go(level: float, *, weight: float = 0.0, jerk: float = 0.0) -> None:
-        levels.append(level)
-        weights.append(weight)
-        jerks.append(jerk)
-
+    # level of each corner, and the time to it: a weight, except that of a jerk
+    corners, backs = [(0.0, 0.0, 0.0)], list[int]()
     for place, event in zip(places, [*events, "slip"], strict=True):
-        level = max(float(place), levels[-1])
-        go(level, weight=(level - levels[-1]) * _RATE ** rng.uniform(-1, 1))
+        level = max(float(place), corners[-1][0])
+        corners.append((level, (level - corners[-1][0]) * _RATE ** rng.uniform(-1, 1), 0.0))
         if event == "rest":
-            go(level, weight=rng.uniform(*_REST))
+            corners.append((level, rng.uniform(*_REST), 0.0))
         elif event == "jerk":
             following = float(places[np.searchsorted(places, level, side="right")])
-            go(level + rng.uniform(0.3, 0.9) * (following - level), jerk=rng.uniform(*_JERK_S) / duration_s)
+            jerked = level + rng.uniform(0.3, 0.9) * (following - level)
+            corners.append((jerked, 0.0, rng.uniform(*_JERK_S) / duration_s))
         elif event == "let back":
-            backs.append(len(levels))
-            go(level * (1 - rng.uniform(*_LET_BACK)), weight=rng.uniform(*_REST))
-            go(level, weight=rng.uniform(*_REST))
-    shares = np.array(jerks) + np.array(weights) / sum(weights) * (1 - sum(jerks))
+            backs.append(len(corners))
+            corners.append((level * (1 - rng.uniform(*_LET_BACK)), rng.uniform(*_REST), 0.0))
+            corners.append((level, rng.uniform(*_REST), 0.0))
+    levels, weights, jerks = np.array(corners).T
+    shares = jerks + weights / sum(weights) * (1 - sum(jerks))
     times = np.cumsum(shares) / shares.sum()
     used = np.interp(progress, times, levels)
     let_back, retaken = np.zeros_like(used), np.zeros_like(used)
@@ -210,13 +214,8 @@ def load_grasp(
         # a slow swing of the puller, small enough that the margin never rises
         swing = rng.uniform(-0.5, 0.5) * np.sin(2 * np.pi * pulled) / (2 * np.pi)
         used, history = np.clip(pulled + swing, 0, 1), [np.zeros(frames)] * 2
-    sliding = slide(time_s - time_s[slip], static_friction=static, grasp=grasp, stuck_until=let_go - slip)
-    friction = ContactFriction(
-        coefficient=np.where(index < slip, static, sliding.coefficient),
-        used=np.where(index < slip, used, sliding.used),
-        carried=np.where(index < slip, 0.0, sliding.carried),
-        slips=(index >= slip) & sliding.slips,
-    )
+    since_slip_s, stuck_until = time_s - time_s[slip], let_go - slip
+    friction = slide(since_slip_s, used=used, static_friction=static, grasp=grasp, stuck_until=stuck_until)
     held_s = np.where(index < touch, 0, time_s - time_s[touch])
     return _label(time_s, normal=normal, static=static, friction=friction, held_s=held_s, history=history)
 
@@ -379,13 +378,8 @@ def move_markers(sensor: Sensor, grasp: Grasp, *, loading: Loading, displacement
     centre_m = np.asarray(grasp.contact_offset) * sphere_m
     from_centre = rest[:, :2] - centre_m
     distance = np.linalg.norm(from_centre, axis=-1)
-    outward, inward = hertz_displacement(
-        distance,
-        depth_m,
-        contact_radius_m=contact_m[:, None],
-        sphere_radius_m=sphere_m,
-        poisson_ratio=sensor.poisson_ratio,
-    )
+    lengths_m = {"contact_radius_m": contact_m[:, None], "sphere_radius_m": sphere_m}
+    outward, inward = hertz_displacement(distance, depth_m, **lengths_m, poisson_ratio=sensor.poisson_ratio)
     yielding = model.layer * clamp
     outward, inward = outward * yielding / np.where(distance > 0, distance, 1), inward * yielding
     pull = np.array([np.cos(grasp.shear_direction_rad), np.sin(grasp.shear_direction_rad)])
@@ -401,8 +395,7 @@ def move_markers(sensor: Sensor, grasp: Grasp, *, loading: Loading, displacement
             depth_m,
             friction_coefficient=friction * model.local_friction,
             safety_margin=margin,
-            contact_radius_m=contact_m[:, None],
-            sphere_radius_m=sphere_m,
+            **lengths_m,
             poisson_ratio=sensor.poisson_ratio,
         )
         skin = model.skin_shear * sphere_m * friction / _FITTED_FRICTION * sunken[:, None]

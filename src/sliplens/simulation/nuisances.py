@@ -18,8 +18,7 @@ class Nuisances:
 
     Friction and normal force are drawn independently: were they tied, the size of the contact alone would give the
     safety margin. Offsets and depths are in radii of the contact's sphere, angles in degrees, image lengths in pixels,
-    brightness in grey levels. A range that is not finite, runs downwards or holds impossible values is a
-    `ContactError`.
+    brightness in grey levels. A range that runs downwards or holds impossible values is a `ContactError`.
     """
 
     dry_friction: Range = (0.5, 1.2)
@@ -81,24 +80,24 @@ class Nuisances:
         for field in fields(self):
             value = getattr(self, field.name)
             low, high = value if isinstance(value, tuple) else (value, value)
-            if not (np.isfinite(low) and np.isfinite(high) and low <= high):
-                raise ContactError(f"the range of {field.name} is {value}; give a finite low, then a high")
-            if (field.name in _POSITIVE and low <= 0) or (field.name in _NOT_NEGATIVE and low < 0):
-                must = "be positive" if field.name in _POSITIVE else "not be negative"
-                raise ContactError(f"{field.name} must {must}, got {low:.3g}; raise its lower end")
-            if high > (limit := _UPPER.get(field.name, np.inf)):
-                raise ContactError(f"{field.name} must be at most {limit:g}, got {high:.3g}; lower its upper end")
+            least, most = _LIMITS.get(field.name, (-_MOST, _MOST))
+            if not least <= low <= high <= most:
+                raise ContactError(f"{field.name} is {value}; give a low, then a high, from {least:g} to {most:g}")
 
 
-_POSITIVE = {"dry_friction", "dry_friction_factor", "wet_friction", "kinetic_ratio", "normal_force_n", "modulus_factor"}
-_POSITIVE |= {"shear_exponent", "creep_time_s", "stick_slip_hz", "white_balance", "gain", "marker_radius"}
-_POSITIVE |= {"marker_contrast", "sensor_gain", "sensor_white_balance", "frame_zoom"}
-_NOT_NEGATIVE = {"contact_offset", "marker_depth", "stick_slip_share", "creep", "illumination_gradient", "glare"}
-_NOT_NEGATIVE |= {"skin_grain", "marker_jitter_px", "blur_px", "sensor_gradient", "sensor_glare"}
-_UPPER: dict[str, float] = dict.fromkeys(
-    ("contact_offset", "marker_depth", "normal_force_drift", "wet_friction_drift"), 0.5
-)
-_UPPER |= {"kinetic_ratio": 1.0, "stick_slip_share": 1.0, "illumination_gradient": 1.0, "sensor_gradient": 1.0}
+_MOST, _SMALL = 1e6, 1e-6
+_LIMITS: dict[str, Range] = {
+    **dict.fromkeys(("dry_friction", "dry_friction_factor", "wet_friction", "normal_force_n"), (_SMALL, _MOST)),
+    **dict.fromkeys(("modulus_factor", "shear_exponent", "creep_time_s", "stick_slip_hz"), (_SMALL, _MOST)),
+    **dict.fromkeys(("white_balance", "gain", "marker_radius", "marker_contrast"), (_SMALL, _MOST)),
+    **dict.fromkeys(("sensor_gain", "sensor_white_balance", "frame_zoom"), (_SMALL, _MOST)),
+    **dict.fromkeys(("creep", "glare", "sensor_glare", "skin_grain", "marker_jitter_px", "blur_px"), (0.0, _MOST)),
+    **dict.fromkeys(("stick_slip_share", "illumination_gradient", "sensor_gradient"), (0.0, 1.0)),
+    **dict.fromkeys(("contact_offset", "marker_depth"), (0.0, 0.5)),
+    **dict.fromkeys(("normal_force_drift", "wet_friction_drift"), (-0.5, 0.5)),
+    "kinetic_ratio": (_SMALL, 1.0),
+}
+"""Smallest and largest value of a range."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -206,7 +206,7 @@ def read_recipe(folder: Path) -> SimulationRecipe:
         return SimulationRecipe(sensor=sensor, **fields)
     except (InputError, KeyError, TypeError, AttributeError, ValueError, ArithmeticError):
         raise InputError(
-            f"{path} holds no recipe of simulated trials; give the recipe, or a data set that sliplens simulate made"
+            f"{path} holds no recipe of simulated trials; choose a data set that `sliplens simulate` made"
         ) from None
 
 
@@ -290,14 +290,9 @@ def _spread(trials: int, *, days: int, tested: range) -> dict[int, int]:
     """Deal dry trials to the days in turn, to the first and a test day first so that no split is empty."""
     between = [day for day in range(2, days + 1) if day not in tested]
     order = [1, tested[-1], *between, *tested[:-1]]
-    counts = dict.fromkeys(order, 0)
-    for index in range(trials):
-        counts[order[index % len(order)]] += 1
-    if not between:
-        # the first day has to feed two splits
-        while counts[1] < 2:
-            counts[tested[-1]] -= 1
-            counts[1] += 1
+    counts = {day: len(range(index, trials, len(order))) for index, day in enumerate(order)}
+    if not between and counts[1] < 2:  # the first day has to feed two splits
+        counts |= {1: 2, tested[-1]: counts[tested[-1]] - 1}
     return counts
 
 

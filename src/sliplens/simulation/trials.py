@@ -161,12 +161,12 @@ def visible_markers(sensor: Sensor) -> Int[np.ndarray, " markers"]:
 _ROUNDING = 1  # grey levels by which another device or library may draw the same scene differently
 
 
-def rebuild_trial(folder: Path, recording: Recording, *, recipe: SimulationRecipe | None = None) -> Film:
-    """Prepare a stored simulated trial to be drawn again with the same bytes; its recipe is read if None."""
+def rebuild_trial(folder: Path, recording: Recording) -> Film:
+    """Prepare a trial of a simulated data set to be drawn again with the same bytes."""
     name, truth = recording.trial, recording.truth
     if truth is None:
         raise InputError(f"trial {name} has no simulated truth and cannot be drawn again; choose a simulated data set")
-    recipe = read_recipe(folder) if recipe is None else recipe
+    recipe = read_recipe(folder)
     plans = {plan.trial: plan for plan in plan_trials(recipe)}
     if recipe.hash != truth.recipe or name not in plans:
         raise InputError(
@@ -197,8 +197,7 @@ def put_markers_back(
     source, there = (film.untouched(), 0) if to is None else (film, to)
 
     def where_back(path: np.ndarray, paths: np.ndarray) -> np.ndarray:
-        chosen = back[..., None] if path.ndim == 3 else back
-        return np.where(chosen, paths[there], path[frame][None])
+        return np.where(back[..., None] if path.ndim == 3 else back, paths[there], path[frame])
 
     moved = {
         name: where_back(getattr(motion, name), getattr(source.motion, name))

@@ -1,12 +1,13 @@
 """The trial of the published difference images, real and simulated."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from sliplens.images import absolute_difference, read_image
-from sliplens.simulation.filming import prepare_film
+from sliplens.simulation.filming import Film, prepare_film
 from sliplens.simulation.loading import load_at_margins
 from sliplens.simulation.nuisances import Day, Grasp, Unit
 from sliplens.simulation.sensor import CHROMATOUCH, Sensor
@@ -60,18 +61,30 @@ def without_noise(sensor: Sensor) -> Sensor:
     return replace(sensor, noise=replace(sensor.noise, **nothing))
 
 
-def simulate(seed: int = 0) -> Simulated:
-    """Simulate the trial with the fitted defaults of `Grasp`, on the nominal sensor."""
-    sensor, grasp = CHROMATOUCH, Grasp()
-    loading = load_at_margins(MARGINS, grasp=grasp)
-    film = prepare_film(
-        sensor,
-        loading=loading,
+def film_of(
+    margins: Sequence[float] | np.ndarray,
+    *,
+    grasp: Grasp,
+    sensor: Sensor = CHROMATOUCH,
+    day: Day | None = None,
+    noise: bool = False,
+    displacement: str | None = None,
+) -> Film:
+    """Film frames of given margins on the nominal sensor."""
+    return prepare_film(
+        sensor if noise else without_noise(sensor),
+        loading=load_at_margins(np.array(margins), grasp=grasp),
         grasp=grasp,
-        day=Day(),
+        day=day or Day(),
         unit=nominal_unit(sensor.geometry.markers),
-        rng=np.random.default_rng(seed),
+        rng=np.random.default_rng(0),
+        displacement=displacement,
     )
+
+
+def simulate() -> Simulated:
+    """Simulate the trial with the fitted defaults of `Grasp`, on the nominal sensor."""
+    film = film_of(MARGINS, grasp=Grasp(), noise=True)
     return Simulated(
         images=absolute_difference(film.draw(slice(0, len(MARGINS))).numpy(), film.draw_reference().numpy()),
         rest_px=film.marker_rest_px,
