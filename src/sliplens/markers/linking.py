@@ -118,10 +118,8 @@ class Pattern:
             for match in rivals
             if match.paired.sum() >= most or _stands_out(match, tried, share=_MOVING_SHARE, rivals=0.5)
         ]
-        if not rivals:
-            return None
-        best = max(rivals, key=lambda match: match.paired.sum() * match.support / (match.spread_px + 0.1))
-        return None if any(_rules_out(other, best) for other in rivals) else best
+        best = max(rivals, key=lambda match: match.paired.sum() * match.support / (match.spread_px + 0.1), default=None)
+        return None if best is None or any(_rules_out(other, best) for other in rivals) else best
 
     def accept(self, origin_px: Places, spots_px: Spots, spot: Matches) -> Pairing | None:
         """Accept spots measured at the last places of the markers, -1 for none, where the step is small and smooth."""
