@@ -17,9 +17,9 @@ from scipy.ndimage import binary_dilation
 from sliplens.images import absolute_difference
 from sliplens.plots import style
 from sliplens.plots.saliency import PictureRow, draw_pictures
-from sliplens.plots.sheets import TIMES, brighten, brightening, choose_margins, choose_untouched
+from sliplens.plots.sheets import TIMES, brighten, brightening, choose_margins
 from sliplens.plots.style import drawing_style
-from sliplens.recordings import Recording
+from sliplens.recordings import ContactState, Recording
 from sliplens.recordings.trial import OUTSIDE, STICKS
 from sliplens.results.explanation import MARGIN_LEVELS
 from sliplens.simulation import FLAT_GEL, PRESETS, SimulationRecipe, plan_trials, simulate_trial
@@ -40,6 +40,12 @@ def paint_outlines(camera: UInt8[np.ndarray, "height width 3"], contact: UInt8[n
         for steps, colour in ((2, style.BLACK), (1, inner)):
             rim = binary_dilation(zone, iterations=steps * thick) & ~zone
             camera[rim] = np.round(255 * np.array(to_rgb(colour)))
+
+
+def choose_untouched(recording: Recording) -> int | None:
+    """Choose the middle frame of those without contact; None without any."""
+    free = [index for index, state in enumerate(recording.contact_state) if state == ContactState.NO_CONTACT]
+    return free[len(free) // 2] if free else None
 
 
 def draw_contact_sheet(recordings: Sequence[Recording]) -> Figure:

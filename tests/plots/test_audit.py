@@ -13,16 +13,8 @@ from matplotlib.text import Text
 
 from sliplens.plots.sheets import STATE_COLOURS, draw_audit, spread_audit_frames
 from sliplens.recordings import ContactState, Recording
-from sliplens.recordings.labelling import (
-    ForceAxes,
-    ForceFault,
-    FrictionEstimate,
-    LabelBasis,
-    Labelling,
-    Lag,
-    Reason,
-    ReferenceChoice,
-)
+from sliplens.recordings import labelling as labels
+from sliplens.recordings.labelling import Labelling, Lag
 
 NO_CONTACT, CONTACT, INCIPIENT_SLIP, FULL_SLIP, _ = ContactState
 MU = 0.53
@@ -38,7 +30,7 @@ def make_trial(*, pull: int = 41, lowest: float = 0.0, step_s: float = 0.04, **m
     return replace(trial, safety_margin_sigma=np.where(valid, 0.031, np.nan), valid=valid, reason=reason)
 
 
-AXES = ForceAxes(
+AXES = labels.ForceAxes(
     normal="z",
     sign=-1,
     tare_n=(0.211, -0.322, 1.433),
@@ -46,28 +38,19 @@ AXES = ForceAxes(
     tare_sigma_n=(0.001, 0.002, 0.003),
     still_until_s=0.12,
 )
-FRICTION = FrictionEstimate(
-    mu=MU,
-    low=0.517,
-    high=0.546,
-    onset_s=1.97,
-    method="break of F_t / F_n, seen in the image",
+FRICTION = labels.FrictionEstimate(
+    mu=MU, low=0.517, high=0.546, onset_s=1.97, method="break of F_t / F_n, seen in the image"
 )
 LAG = Lag(lag_s=0.015, sigma_s=0.009, correlation=0.87)
-REFERENCE = ReferenceChoice(index=2, method="least contact energy")
+REFERENCE = labels.ReferenceChoice(index=2, method="least contact energy")
 
 
 def make_labelling(
-    *, reference: ReferenceChoice = REFERENCE, source: str = "/data/one.mkv", **changes: Any
+    *, reference: labels.ReferenceChoice = REFERENCE, source: str = "/data/one.mkv", **changes: Any
 ) -> Labelling:
     """Everything found, nothing doubtful; the trial slips at 1.97 s."""
-    basis = LabelBasis(
-        axes=AXES,
-        friction=FRICTION,
-        slip_s=1.97,
-        lag=LAG,
-        lag_applied=False,
-        contact_threshold_n=0.061,
+    basis = labels.LabelBasis(
+        axes=AXES, friction=FRICTION, slip_s=1.97, lag=LAG, lag_applied=False, contact_threshold_n=0.061
     )
     return Labelling(
         source=source,
@@ -98,8 +81,8 @@ def onsets(ax: Axes) -> list[float]:
 
 def test_flags_stand_before_what_is_told():
     faults = (
-        ForceFault(kind=Reason.SPIKE, start_s=1.0, end_s=1.0, largest_n=70.0),
-        ForceFault(kind=Reason.SPIKE, start_s=1.4, end_s=1.41, largest_n=9.0),
+        labels.ForceFault(kind=labels.Reason.SPIKE, start_s=1.0, end_s=1.0, largest_n=70.0),
+        labels.ForceFault(kind=labels.Reason.SPIKE, start_s=1.4, end_s=1.41, largest_n=9.0),
     )
     words = told(draw_audit(make_trial(), make_labelling(faults=faults, doubts=("a friction of 9 was given",))))
     assert "a friction of 9 was given" in words
@@ -109,15 +92,8 @@ def test_flags_stand_before_what_is_told():
 def test_words_hold_what_the_labels_rest_on():
     words = told(draw_audit(make_trial(), make_labelling()))
 
-    numbers = ("46 of 53", "± 3.1 %", "0.530 (68 % interval 0.517 to 0.546)", "1.970 s", "15.0 ± 9.0 ms")
-    names = (
-        "day1-dry-001",
-        "test-sensor, day 1, dry",
-        "/data/one.mkv",
-        "/data/one.csv",
-        "frame 2",
-        "times are those of",
-    )
+    numbers = ("46 of 53", "± 3.1 %", "0.530 (68 % interval 0.517 to 0.546)", "1.970 s", "15.0 ± 9.0 ms", "frame 2")
+    names = ("day1-dry-001", "test-sensor, day 1, dry", "/data/one.mkv", "/data/one.csv", "times are those of")
     for fact in (*numbers, *names):
         assert fact in words
 

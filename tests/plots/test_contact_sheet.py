@@ -5,10 +5,7 @@ import pytest
 from drawn import pulled_trial
 from there import there
 
-from sliplens.plots.sheets import (
-    brightening,
-    choose_margins,
-)
+from sliplens.plots.sheets import brightening, choose_margins
 from sliplens.recordings import ContactState
 from sliplens.results.explanation import MARGIN_LEVELS
 
@@ -18,7 +15,6 @@ NO_CONTACT, CONTACT, INCIPIENT_SLIP, FULL_SLIP, _ = ContactState
 @pytest.mark.parametrize("pull", [11, 41, 700])
 def test_chosen_frames_are_the_nearest_to_the_margins(pull):
     trial = pulled_trial(pull=pull)
-
     for nominal, index in zip(MARGIN_LEVELS, choose_margins(trial), strict=True):
         nearest = np.nanmin(np.abs(trial.safety_margin - nominal))
         # frames within half a percentage point are told apart by their force alone
@@ -28,12 +24,9 @@ def test_chosen_frames_are_the_nearest_to_the_margins(pull):
 def test_full_stick_is_shown_where_the_sensor_is_pressed_hardest():
     trial = pulled_trial()
 
-    first = there(choose_margins(trial)[0])
-
-    assert trial.contact_state[first] == CONTACT
-    assert (
-        trial.normal_force_n[first] == trial.normal_force_n[[state == CONTACT for state in trial.contact_state]].max()
-    )
+    first, pressed = there(choose_margins(trial)[0]), [state == CONTACT for state in trial.contact_state]
+    assert pressed[first]
+    assert trial.normal_force_n[first] == trial.normal_force_n[pressed].max()
 
 
 def test_frames_of_a_later_stick_are_left_alone():

@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from made_up import write_workspace
-from matplotlib.figure import Figure
 
 import sliplens as sl
 from sliplens.errors import InputError
@@ -30,19 +29,6 @@ def explanation(results) -> Explanation:
     frames = tuple(replace(frame, prediction=0.2, reference_prediction=1.0) for frame in some.frames)
     methods = {"grad-cam": some.methods["grad-cam"]}
     return replace(some, frames=frames, methods=methods, relevance={"grad-cam": relevance})
-
-
-def test_records_of_a_workspace_have_a_figure_each(results):
-    for record, label in (
-        (results.evaluations["raw"], "True Γ (%)"),
-        (results.trainings["raw"], "Epoch (passes over the training frames)"),
-        (results.deletion["raw"], "Pixels removed (%)"),
-        (results.evaluations["raw"].predictions, "Time (s)"),
-    ):
-        figure = sl.plot(record)
-
-        assert isinstance(figure, Figure)
-        assert figure.axes[0].get_xlabel() == label
 
 
 def test_what_raises_is_blue_and_what_lowers_is_orange(explanation):
@@ -70,12 +56,9 @@ def test_a_prediction_that_is_that_of_the_baseline_has_nothing_to_explain(explan
     assert "nothing to explain" in sl.plot(replace(explanation, frames=frames)).axes[0].get_title(loc="left")
 
 
-def test_a_number_that_is_not_there_is_told(explanation):
+def test_what_is_not_there_and_what_has_no_picture_is_told(explanation):
     with pytest.raises(InputError, match="there is no number 2 among 2; count from 0"):
         sl.plot(explanation, index=2)
-
-
-def test_what_has_no_picture_is_told():
     with pytest.raises(InputError, match="there is no picture of a SimpleNamespace; there is one of Evaluation"):
         sl.plot(SimpleNamespace())
 

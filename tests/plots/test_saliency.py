@@ -5,11 +5,7 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 from sliplens.images import read_image
-from sliplens.plots.saliency import (
-    draw_explanation,
-    full_colour,
-    overlay_relevance,
-)
+from sliplens.plots.saliency import draw_explanation, full_colour, overlay_relevance
 from sliplens.plots.style import ORANGE, SKY
 from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes
 

@@ -208,11 +208,8 @@ def plot_predictions(predictions: ScoredFrames, *, ax: Axes) -> Axes:
 def plot_learning_curves(trainings: Mapping[str, Training], *, ax: Axes) -> Axes:
     """Draw the error on the training and validation frames by epoch, one colour an input; a ring is at the best."""
     for name in style.inputs_in_order(trainings):
-        curve, colour, label = (
-            trainings[name].curve,
-            style.INPUT_COLOURS.get(name, style.PURPLE),
-            style.short_input_name(name),
-        )
+        curve, label = trainings[name].curve, style.short_input_name(name)
+        colour = style.INPUT_COLOURS.get(name, style.PURPLE)
         dot = "." if len(curve.epoch) <= 40 else ""  # one epoch alone makes no line
         ax.plot(curve.epoch, curve.train_mse, color=colour, linestyle=":", marker=dot, label=f"{label}, training")
         ax.plot(curve.epoch, curve.validation_mse, color=colour, marker=dot, label=f"{label}, validation")

@@ -75,12 +75,8 @@ def draw_explanation(explanation: Explanation, folder: Path) -> None:
         pictures = overlay_points(explanation.pictures, relevance, scale=explanation.scale)
         for frame, picture in zip(explanation.frames, pictures, strict=True):
             write_png(overlays / f"{frame.id}.png", picture)
-        shown = [pictures[column] for column in columns]
-        rows.append(
-            PictureRow(
-                name=method_name(method), pictures=shown, full=full_points(relevance, scale=explanation.scale) / per
-            )
-        )
+        full = full_points(relevance, scale=explanation.scale) / per
+        rows.append(PictureRow(name=method_name(method), pictures=[pictures[at] for at in columns], full=full))
     titles = []
     for frame in (explanation.frames[column] for column in columns):
         name = frame.id if len(frame.id) <= 22 else f"\N{HORIZONTAL ELLIPSIS}{frame.id[-21:]}"
@@ -107,12 +103,7 @@ class PictureRow:
 
 
 def draw_pictures(
-    rows: Sequence[PictureRow],
-    *,
-    heads: Sequence[str],
-    bar: bool = False,
-    words: str = _BAR_WORDS,
-    title: str | None = None,
+    rows: Sequence[PictureRow], *, heads: Sequence[str], bar: bool = False, words: str = _BAR_WORDS
 ) -> Figure:
     """Draw rows of pictures under heads, and the bar of their colours with words below."""
     gap, foot = 0.25 if any(row.words for row in rows) else 0.06, 0.8 if bar else 0.1
@@ -121,7 +112,6 @@ def draw_pictures(
     small: Any = {"fontsize": 7.5, "parse_math": False}
     with drawing_style():
         figure = Figure(figsize=(width, height))
-        figure.text(0.1 / width, 1 - 0.05 / height, title or "", va="top", fontsize=11, weight="bold", parse_math=False)
         # a fixed grid: laying out a hundred axes takes seconds
         grid = figure.add_gridspec(
             len(rows), len(heads), wspace=0.06 / _CELL_IN, hspace=gap / _CELL_IN,

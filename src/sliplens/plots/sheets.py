@@ -82,12 +82,6 @@ def choose_margins(recording: Recording) -> list[int | None]:
     return chosen
 
 
-def choose_untouched(recording: Recording) -> int | None:
-    """Choose the middle frame of those without contact; None without any."""
-    free = [index for index, state in enumerate(recording.contact_state) if state == ContactState.NO_CONTACT]
-    return free[len(free) // 2] if free else None
-
-
 _FRAMES = 6  # beside the reference
 _WRAP, _MOST_LINES, _LINE = 47, 54, 0.0165  # characters of a line, lines of the page, and their height as a share
 

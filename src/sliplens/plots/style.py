@@ -153,9 +153,9 @@ def conditions_in_order(names: Iterable[str]) -> list[str]:
     return in_order(set(names), ("dry", "wet"))
 
 
-def percent(value: float | None, *, digits: int = 0) -> str:
+def percent(value: float | None) -> str:
     """Write a share as a percentage, or a dash for None and NaN; without the sign of a negative zero."""
-    return UNKNOWN if value is None or np.isnan(value) else f"{decimals(100 * value, digits)}\N{NO-BREAK SPACE}%"
+    return UNKNOWN if value is None or np.isnan(value) else f"{decimals(100 * value, 0)}\N{NO-BREAK SPACE}%"
 
 
 def amount(value: float, unit: str) -> str:
