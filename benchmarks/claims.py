@@ -24,7 +24,6 @@ from sliplens.codec import write_json
 from sliplens.intervals import Difference, mean_interval, paired_difference
 from sliplens.plots.style import UNKNOWN, input_name, inputs_in_order, method_name
 from sliplens.recordings import Dataset
-from sliplens.report.results import Results, load_results
 from sliplens.report.verdict import (
     AS_RUN,
     DELETION,
@@ -39,7 +38,7 @@ from sliplens.report.verdict import (
     write_ends,
 )
 from sliplens.results.faithfulness import CHANCE, DeletionCurve
-from sliplens.results.study import QUICK_METHODS, MarkerEffects, StudyConfig
+from sliplens.results.study import QUICK_METHODS, MarkerEffects, Results, StudyConfig, load_results
 
 POLY_CAM, GRAD_CAM, NOISY = (f"{method}{AS_RUN}" for method in ("poly-cam", "grad-cam", "integrated-gradients"))
 """Methods as the thesis ran them: its claims are of these alone."""

@@ -131,7 +131,7 @@ def test_a_method_equal_to_a_control_has_no_lead():
         found = lead(own, controls)
         low, high = ends_of(found.gap)
         assert low <= found.gap.estimate <= high <= 0
-        assert not found.shows_something
+        assert not found.gap.above_zero
 
 
 def test_a_lead_is_no_larger_than_that_over_any_control_alone_nor_over_chance():
@@ -154,8 +154,8 @@ def test_a_lead_is_no_larger_than_that_over_any_control_alone_nor_over_chance():
     wild = np.where(TRIALS == 0, -9.0, 0.4) + own.mean()
     uncertain = lead(own + 0.5, {"edges": own, "wild": wild})
     assert uncertain.control == "edges"
-    assert lead(own + 0.5, {"edges": own}).shows_something
-    assert not uncertain.shows_something
+    assert lead(own + 0.5, {"edges": own}).gap.above_zero
+    assert not uncertain.gap.above_zero
 
 
 def test_a_method_as_good_as_every_control_is_seldom_behind_or_ahead_for_sure():
@@ -174,15 +174,15 @@ def test_a_method_that_is_ahead_of_all_in_every_trial_shows_something_and_one_be
     gains = np.linspace(0.1, 0.3, 21)
     ahead = lead(gains + 0.2, {"edges": gains, "centre": gains[::-1]})
     assert ahead.gap.estimate == pytest.approx(0.2)
-    assert ahead.shows_something
+    assert ahead.gap.above_zero
     below = lead(-gains, {})
     assert below.control == "random"
     assert below.gap.estimate == pytest.approx(-0.2)
-    assert not below.shows_something
+    assert not below.gap.above_zero
     # frames of one trial are no trials
     few = lead_over_controls(gains + 0.2, {"edges": gains}, clusters=[TRIALS // 2], rng=np.random.default_rng(5))
     assert few.gap.units == 4
-    assert not few.shows_something
+    assert not few.gap.above_zero
     one = lead_over_controls(gains + 0.2, {"edges": gains}, clusters=[0 * TRIALS], rng=np.random.default_rng(5))
     assert (one.gap.low, one.gap.high) == (None, None)
-    assert not one.shows_something
+    assert not one.gap.above_zero

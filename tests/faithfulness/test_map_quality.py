@@ -4,13 +4,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sliplens.faithfulness.controls import (
-    infidelity,
-    max_sensitivity,
-    relevance_mass,
-    resolution,
-    total_variation,
-)
+from sliplens.faithfulness.controls import infidelity, max_sensitivity, relevance_mass, resolution, total_variation
 
 
 def test_total_variation_has_its_closed_forms(rng: np.random.Generator):

@@ -6,12 +6,7 @@ import torch
 
 from sliplens.explainers.occlusion import tile_regions
 from sliplens.faithfulness.fills import get_fill
-from sliplens.faithfulness.removal import (
-    random_unit_order,
-    removal_curves,
-    score_maps,
-    unit_order,
-)
+from sliplens.faithfulness.removal import lost_evidence, random_unit_order, removal_curves, score_maps, unit_order
 from sliplens.models.engines import Engine
 
 SIZE = 20
@@ -44,8 +39,7 @@ def test_the_curve_of_a_linear_network_is_the_sum_of_what_went(images: torch.Ten
     values = contributions(images, weights)
     units = PIXELS
     orders = np.stack([[unit_order(one, units, least_first=least) for one in values] for least in (False, True)])
-    curves = removal_curves(linear(weights), images, orders, fill=get_fill("black"), areas=EVERY)
-    lost = curves.lost(UP)
+    lost = lost_evidence(removal_curves(linear(weights), images, orders, fill=get_fill("black"), areas=EVERY), UP)
     for index, one in enumerate(values):
         falling = np.sort(one.ravel())[::-1]
         np.testing.assert_allclose(lost[0, index], np.append(0, np.cumsum(falling)), atol=1e-12)
@@ -106,7 +100,7 @@ def test_the_batch_size_changes_nothing(images: torch.Tensor, weights: torch.Ten
             batch_size=size,
             answers=lambda batches: ((linear(weights)(batch).sin(),) for batch in batches),
         )
-        return removal_curves(engine, images, orders, fill=get_fill(fill), seed=4).answers
+        return removal_curves(engine, images, orders, fill=get_fill(fill), seed=4)
 
     # noise is solved by iterations that stop when all of a batch are done: within their tolerance, times the weights
     for fill, tolerance in (("grey", 1e-12), ("noisy-linear", 1e-3)):
@@ -116,5 +110,5 @@ def test_the_batch_size_changes_nothing(images: torch.Tensor, weights: torch.Ten
 
 def test_a_network_that_answers_always_alike_moves_by_nothing(images: torch.Tensor, rng):
     orders = np.stack([[random_unit_order(PIXELS, rng=rng)] * IMAGES])
-    curves = removal_curves(lambda batch: torch.full((len(batch),), 0.3), images, orders, fill=get_fill("grey"))
-    assert np.all(curves.lost(UP) == 0)
+    answers = removal_curves(lambda batch: torch.full((len(batch),), 0.3), images, orders, fill=get_fill("grey"))
+    assert np.all(lost_evidence(answers, UP) == 0)

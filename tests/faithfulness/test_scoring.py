@@ -118,30 +118,16 @@ def test_deletion_removes_the_most_salient_first_and_a_random_order_beside(run):
 
 def test_a_folder_holds_the_record_that_is_returned_without_one(run, tmp_path):
     explanation = sliplens.explain(run, FRAMES, method=get_explainer("occlusion", tile_px=1))
-    scored = sliplens.score(run, explanation, random_orders=1, steps=4)
-    saved = sliplens.score(run, explanation, random_orders=1, steps=4, out=tmp_path / "scores")
+    score = partial(sliplens.score, run, explanation, random_orders=1, steps=4)
+    scored, saved = score(), score(out=tmp_path / "scores")
     assert saved.scores == scored.scores
     assert saved.deletion == scored.deletion
     np.testing.assert_array_equal(saved.table.most_first, scored.table.most_first)
-    progress = []
-    again = sliplens.score(
-        run,
-        explanation,
-        random_orders=1,
-        steps=4,
-        out=tmp_path / "scores",
-        on_progress=lambda *step: progress.append(step),
-    )
+    progress, out = [], tmp_path / "scores"
+    again = score(out=out, on_progress=lambda *step: progress.append(step))
     assert again.scores == scored.scores
     assert not progress
     assert not (tmp_path / "scores" / "parts").exists()
-
-
-def test_an_explanation_of_another_network_is_refused(run):
-    explanation = sliplens.explain(run, FRAMES, method="integrated-gradients")
-    other = replace(run, manifest=replace(run.manifest, weights_sha256="other"))
-    with pytest.raises(CheckpointError, match="made with another network; explain the frames again with this run"):
-        sliplens.score(other, explanation)
 
 
 @pytest.mark.parametrize(
@@ -157,13 +143,17 @@ def test_maps_that_are_not_of_the_frames_are_refused(run, maps, message):
         sliplens.score(run, FRAMES, maps)
 
 
-def test_an_impossible_option_is_refused_before_a_network_is_loaded(run):
+def test_what_cannot_be_scored_is_refused_an_impossible_option_before_a_network_is_loaded(run):
     with pytest.raises(InputError, match="there is no fill named 'pink'"):
         sliplens.score("no such run", FRAMES, EFFECTS, fill="pink")
     with pytest.raises(InputError, match="0 random orders are too few; --random-orders must be at least 1"):
         sliplens.score("no such run", FRAMES, EFFECTS, random_orders=0)
     with pytest.raises(InputError, match="no maps to score; give an explanation"):
         sliplens.score(run, FRAMES)
+    explanation = sliplens.explain(run, FRAMES, method="integrated-gradients")
+    other = replace(run, manifest=replace(run.manifest, weights_sha256="other"))
+    with pytest.raises(CheckpointError, match="made with another network; explain the frames again with this run"):
+        sliplens.score(other, explanation)
 
 
 class Curved(Linear):

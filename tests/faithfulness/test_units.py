@@ -7,11 +7,7 @@ from hypothesis.extra.numpy import arrays
 
 from sliplens.errors import InputError, SaliencyError
 from sliplens.explainers.occlusion import marker_regions, tile_regions
-from sliplens.faithfulness.removal import (
-    random_unit_order,
-    unit_means,
-    unit_order,
-)
+from sliplens.faithfulness.removal import random_unit_order, unit_means, unit_order
 
 MAPS = arrays(np.float64, (6, 9), elements=st.floats(-1, 1))
 

@@ -45,7 +45,7 @@ from sliplens.recordings.source import open_source
 from sliplens.recordings.splits import assign_splits, read_split_table
 from sliplens.recordings.store import forces_path, save_forces, save_recording
 from sliplens.recordings.trial import Labels, TrialFacts
-from sliplens.report.results import load_results
+from sliplens.results.study import load_results
 
 Rng = np.random.Generator
 Change = Callable[[Path, Rng], object]

@@ -1,32 +1,20 @@
 """A made-up study: the files that its stages write, with numbers that tests choose and nothing measured."""
 
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from made_up import explained, picture_and_maps, write_evaluation, write_run
 
-from sliplens.faithfulness.scoring import SettingCurves, score_curves, score_deletion
+from sliplens.faithfulness.scoring import frame_columns, score_curves, score_deletion
 from sliplens.intervals import Difference
+from sliplens.results import study as records
 from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes
-from sliplens.results.faithfulness import Lead, MethodGap
-from sliplens.results.study import (
-    Choice,
-    ChosenFrame,
-    ChosenTrial,
-    Localisation,
-    MapMeasures,
-    MapQuality,
-    MarkerEffects,
-    MarkerTable,
-    MetaTest,
-    NeutralScores,
-    Setting,
-    States,
-    Truth,
-)
+from sliplens.results.faithfulness import Lead, MethodGap, RemovalCurve
 
 INPUTS = ("difference", "raw")
 METHODS = ("grad-cam", "integrated-gradients", "poly-cam")
@@ -34,6 +22,9 @@ CONTROLS = ("edges", "centre")
 FILLS = (("reference", "pixel"), ("grey", "pixel"), ("blur", "pixel"), ("reference", "marker"), ("true", "marker"))
 LEVELS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
 SCORED = (0.4, 0.2, 0.0)
+SIZE = 24
+GRID = SIZE * np.stack([axis.ravel() for axis in np.meshgrid(*[np.linspace(0.14, 0.86, 6)] * 2)])
+"""Markers, x and y."""
 GAINS = {"grad-cam": -0.05, "integrated-gradients": 0.06, "poly-cam": 0.16, "edges": 0.02, "centre": 0.01}
 SPEARMAN = {"grad-cam": 0.3, "integrated-gradients": 0.4, "poly-cam": 0.7, "poly-cam-thesis": 0.2}
 MAP_MEASURES = {
@@ -47,17 +38,13 @@ MAP_MEASURES = {
 class Made:
     """What the made-up results say."""
 
-    size: int = 24
     trials: int = 6
-    areas: int = 21
     inputs: tuple[str, ...] = INPUTS
     methods: tuple[str, ...] = METHODS
     """With sound scores."""
     gains: Mapping[str, float] = field(default_factory=lambda: GAINS)
     """Symmetric relevance gain of each method on difference images; raw images get half of it, plus `raw_more`."""
     raw_more: float = 0.0
-    spread: float = 0.01
-    """Of the gains over trials."""
     looks: Mapping[str, Mapping[str, float]] = field(default_factory=lambda: MAP_MEASURES)
     top_share: float = 0.8
     """Of the network's effects that two markers hold."""
@@ -66,9 +53,17 @@ class Made:
     """Of each method's map with the markers' Shapley values; every interval reaches 0.05 either way."""
     sound: bool = True
     """Whether every trial that was taken qualifies."""
+    as_run: str = ""
+    """Ends the names of the methods in maps, deletion scores and map quality."""
 
 
-def frames_of(made: Made) -> list[ChosenFrame]:
+def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    value = json.loads(path.read_text(encoding="utf-8"))
+    change(value)
+    path.write_text(json.dumps(value), encoding="utf-8")
+
+
+def frames_of(made: Made) -> list[records.ChosenFrame]:
     rows = []
     for trial in range(made.trials):
         for level in LEVELS:
@@ -76,7 +71,7 @@ def frames_of(made: Made) -> list[ChosenFrame]:
                 continue
             frame = round(40 * (1 - level))
             rows.append(
-                ChosenFrame(
+                records.ChosenFrame(
                     id=f"t{trial:02d}-f{frame:04d}",
                     trial=f"t{trial:02d}",
                     frame=frame,
@@ -89,7 +84,7 @@ def frames_of(made: Made) -> list[ChosenFrame]:
     return rows
 
 
-def scored_frames(made: Made) -> list[ChosenFrame]:
+def scored_frames(made: Made) -> list[records.ChosenFrame]:
     return [frame for frame in frames_of(made) if frame.scored]
 
 
@@ -111,7 +106,7 @@ def write_study(workspace: Path, made: Made | None = None, *, seed: int = 7) -> 
 
 def write_choice(workspace: Path, made: Made) -> Path:
     trials = tuple(
-        ChosenTrial(
+        records.ChosenTrial(
             trial=f"t{index:02d}",
             qualified=made.sound or index != 1,
             worst_error=dict.fromkeys(made.inputs, 0.01 + 0.005 * index),
@@ -122,12 +117,11 @@ def write_choice(workspace: Path, made: Made) -> Path:
         workspace / "choice",
         "choice",
         {"trials": made.trials},
-        Choice(
+        records.Choice(
             trials_wanted=made.trials,
             tolerance=0.03,
             considered=60,
             qualified=made.trials - (not made.sound),
-            qualified_alone=dict.fromkeys(made.inputs, made.trials),
             mean_error={name: 0.07 if name == "difference" else 0.13 for name in made.inputs},
             source="simulated",
             condition="dry",
@@ -139,26 +133,22 @@ def write_choice(workspace: Path, made: Made) -> Path:
 
 def write_states(workspace: Path, made: Made) -> Path:
     shown = [frame for frame in frames_of(made) if frame.pictured]
-    size, tables = made.size, []
-    x, y = (axis.ravel() for axis in np.meshgrid(*[np.linspace(0.14, 0.86, 6)] * 2))
-    for frame in shown:
-        shift = 0.08 * (1 - frame.safety_margin) * np.exp(-8 * ((y - 0.55) ** 2 + (x - 0.5) ** 2))
-        now_x, now_y = size * x, size * (y + shift)
-        now_x[0] = now_y[0] = np.nan  # one marker was not followed
-        tables.append(
-            MarkerTable(
-                frame_id=np.repeat(frame.id, len(x)),
-                marker=np.arange(len(x)),
-                rest_x_px=size * x,
-                rest_y_px=size * y,
-                x_px=now_x,
-                y_px=now_y,
-            )
-        )
-    return write_run(workspace / "states", "states", {}, States(untracked=(), table=MarkerTable.joined(tables)))
+    x, y = np.tile(GRID, len(shown))
+    shift = 0.08 * (1 - np.repeat([frame.safety_margin for frame in shown], len(GRID[0])))
+    marker = np.tile(np.arange(len(GRID[0])), len(shown))
+    lost = marker == 0  # one marker was not followed
+    table = records.MarkerTable(
+        frame_id=np.repeat([frame.id for frame in shown], len(GRID[0])),
+        marker=marker,
+        rest_x_px=x,
+        rest_y_px=y,
+        x_px=np.where(lost, np.nan, x),
+        y_px=np.where(lost, np.nan, y + SIZE * shift * np.exp(-8 * ((y / SIZE - 0.55) ** 2 + (x / SIZE - 0.5) ** 2))),
+    )
+    return write_run(workspace / "states", "states", {}, records.States(untracked=(), table=table))
 
 
-def frames_explained(rows: Sequence[ChosenFrame]) -> tuple[ExplainedFrame, ...]:
+def frames_explained(rows: Sequence[records.ChosenFrame]) -> tuple[ExplainedFrame, ...]:
     return tuple(
         ExplainedFrame(
             id=row.id,
@@ -172,15 +162,17 @@ def frames_explained(rows: Sequence[ChosenFrame]) -> tuple[ExplainedFrame, ...]:
     )
 
 
-def without_maps(name: str, rows: Sequence[ChosenFrame], size: int) -> Explanation:
-    return explained(name, frames_explained(rows), {}, np.zeros((len(rows), size, size, 3), np.uint8), {})
+def without_maps(name: str, rows: Sequence[records.ChosenFrame]) -> Explanation:
+    return explained(name, frames_explained(rows), {}, np.zeros((len(rows), SIZE, SIZE, 3), np.uint8), {})
 
 
 def write_maps(workspace: Path, name: str, made: Made, *, rng: np.random.Generator) -> None:
     rows = frames_of(made)
-    drawn = [picture_and_maps(row.safety_margin, name, size=made.size, rng=rng) for row in rows]
-    stacked = {method: np.stack([maps[method] for _, maps in drawn]).astype(np.float32) for method in METHODS}
-    notes: dict[str, MethodNotes] = dict.fromkeys(METHODS, MethodNotes(seconds_per_frame=0.1, warnings=()))
+    drawn = [picture_and_maps(row.safety_margin, name, size=SIZE, rng=rng) for row in rows]
+    stacked = {
+        method + made.as_run: np.stack([maps[method] for _, maps in drawn]).astype(np.float32) for method in METHODS
+    }
+    notes: dict[str, MethodNotes] = dict.fromkeys(stacked, MethodNotes(seconds_per_frame=0.1, warnings=()))
     pictures = np.stack([picture for picture, _ in drawn])
     found = explained(name, frames_explained(rows), notes, pictures, stacked)
     write_run(workspace / f"explain-{name}", "explain", {"input": name}, found)
@@ -188,13 +180,13 @@ def write_maps(workspace: Path, name: str, made: Made, *, rng: np.random.Generat
 
 def write_thesis_scores(workspace: Path, name: str, made: Made, *, rng: np.random.Generator) -> Path:
     """Predictions that fall by up to 0.5, the earlier the more the method gains."""
-    rows, share = frames_of(made), np.arange(made.size + 1) / made.size
-    falls = {method: share ** np.exp(-8 * gain_of(made, name, method)) for method in [*METHODS, "random"]}
+    rows, share = frames_of(made), np.arange(SIZE + 1) / SIZE
+    falls = {method + made.as_run: share ** np.exp(-8 * gain_of(made, name, method)) for method in METHODS}
     answers = {
         method: 0.6 - rng.uniform(0.4, 0.6, (len(rows), 1)) * fall - 0.005 * rng.random((len(rows), len(share)))
-        for method, fall in falls.items()
+        for method, fall in (falls | {"random": share}).items()
     }
-    scores = score_deletion(without_maps(name, rows, made.size), answers, fill="grey")
+    scores = score_deletion(without_maps(name, rows), answers, fill="grey")
     scores = replace(scores, alarms=("the fill decides in 2 of 18 frames",))
     return write_run(workspace / f"score-{name}", "score", {"fill": "grey"}, scores)
 
@@ -206,90 +198,84 @@ def gain_of(made: Made, name: str, method: str) -> float:
 
 def write_faithfulness(workspace: Path, name: str, made: Made, *, rng: np.random.Generator) -> Path:
     """Curves whose symmetric gain is the method's own, plus what the trial adds: 6 a (1 - a) has area 1."""
-    areas = np.linspace(0, 1, made.areas)
+    areas = np.linspace(0, 1, 21)
     bump = 6 * areas * (1 - areas)
     bump /= np.trapezoid(bump, areas)
     rows, chance, curves = scored_frames(made), 0.4 * areas, {}
     for fill, unit in FILLS:
         of_setting = {}
         for method in [*made.methods, *CONTROLS]:
-            of_trial = rng.normal(0, made.spread, made.trials)
+            of_trial = rng.normal(0, 0.01, made.trials)
             gains = np.array([gain_of(made, name, method) + of_trial[int(row.trial[1:])] for row in rows])
             half = gains[:, None] / 2 * bump
-            of_setting[method] = np.stack([chance + half, chance - half, chance + 0 * half])
-        answers = {"whole": np.full(len(rows), 0.5), "blank": np.full(len(rows), np.nan)}
-        curves[Setting(fill=fill, unit=unit)] = SettingCurves(areas=areas, curves=of_setting, **answers)
-    scores = score_curves(without_maps(name, rows, made.size), curves, random_orders=20, seed=0)
+            most, least, random = chance + half, chance - half, chance + 0 * half
+            of_setting[method] = RemovalCurve(areas=areas, most_first=most, least_first=least, random=random)
+        curves[records.Setting(fill=fill, unit=unit)] = of_setting
+    scores = score_curves(without_maps(name, rows), curves, random_orders=20, seed=0)
     scores = replace(scores, alarms=("grad-cam does not beat a random order: its symmetric gain is -0.050",))
     return write_run(workspace / f"faithfulness-{name}", "faithfulness", {}, scores)
 
 
 def write_quality(workspace: Path, name: str, made: Made) -> Path:
-    looks = {method: MapMeasures(**values) for method, values in made.looks.items()}
+    looks = {method + made.as_run: records.MapMeasures(**values) for method, values in made.looks.items()}
     rougher = []
-    for first, second in combinations(made.looks, 2):
-        gap = made.looks[first]["total_variation"] - made.looks[second]["total_variation"]
-        rougher.append(MethodGap(first=first, second=second, gap=interval(gap, made.trials, half=0.001)))
+    for (first, one), (second, other) in combinations(looks.items(), 2):
+        gap = interval((one.total_variation or 0) - (other.total_variation or 0), made.trials, half=0.001)
+        rougher.append(MethodGap(first=first, second=second, gap=gap))
     facts = {"input": name, "source": "simulated", "frames": 42}
-    quality = MapQuality(**facts, methods=looks, comparisons=tuple(rougher))
+    quality = records.MapQuality(**facts, methods=looks, comparisons=tuple(rougher))
     return write_run(workspace / f"map-quality-{name}", "map-quality", {}, quality)
 
 
 def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Generator) -> Path:
-    rows, size = scored_frames(made), made.size
-    x, y = (size * axis.ravel() for axis in np.meshgrid(*[np.linspace(0.14, 0.86, 6)] * 2))
-    tables = []
-    for row in rows:
-        network = np.full(len(x), (1 - made.top_share) / (len(x) - 2))
-        network[[14, 20]] = made.top_share / 2
-        # a little of its own in each trial, so that an interval has a width
-        network = 0.3 * network * (1 + 0.02 * rng.random(len(x)))
-        tables.append(
-            MarkerEffects(
-                frame_id=np.repeat(row.id, len(x)),
-                day=np.ones(len(x), dtype=np.int64),
-                trial=np.repeat(row.trial, len(x)),
-                safety_margin=np.full(len(x), row.safety_margin),
-                marker=np.arange(len(x)),
-                x_px=x,
-                y_px=y,
-                shapley=network,
-                shapley_error=0.1 * network,
-                stick=network,
-                state=np.ones(len(x), dtype=np.int64),
-            )
-        )
+    rows, count = scored_frames(made), len(GRID[0])
+    x, y = np.tile(GRID, len(rows))
+    share = np.full(count, (1 - made.top_share) / (count - 2))
+    share[[14, 20]] = made.top_share / 2
+    # a little of its own in each trial, so that an interval has a width
+    network = (0.3 * share * (1 + 0.02 * rng.random((len(rows), count)))).ravel()
+    effects = records.MarkerEffects(
+        **frame_columns(without_maps(name, rows), count),
+        safety_margin=np.repeat([row.safety_margin for row in rows], count),
+        marker=np.tile(np.arange(count), len(rows)),
+        x_px=x,
+        y_px=y,
+        shapley=network,
+        shapley_error=0.1 * network,
+        stick=network,
+        state=np.ones(len(x), dtype=np.int64),
+    )
     known = {"edges": 0.1, "oracle": 1.0, "degraded-oracle": 0.8}
     spearman = {**made.spearman, **known}
-    test = MetaTest(fill="true", oracle=0.3, degraded=0.2, changed=0.1, gap=interval(0.1, made.trials))
+    test = records.MetaTest(fill="true", oracle=0.3, degraded=0.2, changed=0.1, gap=interval(0.1, made.trials))
     return write_run(
         workspace / f"truth-{name}",
         "truth",
         {},
-        Truth(
+        records.Truth(
             input=name,
             source="simulated",
             frames=len(rows),
             methods={
-                method: Localisation(
+                method: records.Localisation(
                     neutral=interval(value, made.trials),
                     stick=interval(value, made.trials),
                     shapley=interval(value, made.trials),
                     lead_over_controls=None
                     if method in known
                     else Lead(control="edges", gap=interval(value - known["edges"], made.trials)),
-                    lead_over_methods={},
                     edges=interval(made.edge_mass - 0.07, made.trials, half=0.01),
                 )
                 for method, value in spearman.items()
             },
             pairs=400,
             meta=(test,),
-            effects=MarkerEffects.joined(tables),
-            neutral=NeutralScores(
-                frame_id=np.tile([row.id for row in rows], len(spearman)),
-                day=np.ones(len(rows) * len(spearman), dtype=np.int64),
-                trial=np.tile([row.trial for row in rows], len(spearman)),
+            effects=effects,
+            neutral=records.NeutralScores(
+                **{
+                    column: np.tile(values, len(spearman))
+                    for column, values in frame_columns(without_maps(name, rows), 1).items()
+                },
                 method=np.repeat(list(spearman), len(rows)),
                 correlation=np.repeat(list(spearman.values()), len(rows)),
             ),

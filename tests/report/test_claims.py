@@ -5,33 +5,16 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 from sliplens.intervals import Difference
-from sliplens.report import load_results
-from sliplens.report.results import Results
+from sliplens.report import load_results, verdict
 from sliplens.report.sections import build_opening, build_sections
-from sliplens.report.verdict import (
-    ClaimRow,
-    MethodRow,
-    answer_trust,
-    cautions,
-    judge_gap,
-    judge_study,
-    load_thesis,
-    voting_settings,
-    why_no_verdict,
-    without_weak,
-    write_gap,
-)
-from sliplens.results.explanation import MethodNotes
+from sliplens.results.study import Results
 
 from .study_results import GAINS, MAP_MEASURES, SPEARMAN, Made, write_choice, write_study
 
 BENCHMARK = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "claims.py")))
-GRAD_CAM, NOISY, POLY_CAM = BENCHMARK.THREE
-THREE = {"grad-cam": GRAD_CAM, "integrated-gradients": NOISY, "poly-cam": POLY_CAM}
 DIFFERENCE, RAW = "Difference images", "Raw images"
 
 
@@ -41,37 +24,12 @@ def made(tmp_path):
     return lambda made=None: load_results(write_study(tmp_path, made or Made()))
 
 
-def as_the_thesis(results: Results) -> Results:
-    """The same, its methods named as those of the thesis."""
-    explanations, deletion = {}, {}
-    for name, record in results.explanations.items():
-        seconds = dict(zip(THREE, (0.02, 0.3, 4.0), strict=True))
-        notes = {new: MethodNotes(seconds_per_frame=seconds[old], warnings=()) for old, new in THREE.items()}
-        maps = {new: record.relevance[old] for old, new in THREE.items()}
-        explanations[name] = replace(record, methods=notes, relevance=maps)
-    for name, scores in results.deletion.items():
-        table, methods = scores.table, {THREE.get(old, old): score for old, score in scores.methods.items()}
-        renamed = np.array([THREE.get(str(method), str(method)) for method in table.method])
-        deletion[name] = replace(scores, table=replace(table, method=renamed), methods=methods)
-    quality = {
-        name: replace(
-            record,
-            methods={THREE[old]: looks for old, looks in record.methods.items()},
-            comparisons=tuple(
-                replace(gap, first=THREE[gap.first], second=THREE[gap.second]) for gap in record.comparisons
-            ),
-        )
-        for name, record in results.map_quality.items()
-    }
-    return replace(results, explanations=explanations, deletion=deletion, map_quality=quality)
-
-
 @pytest.fixture
 def judged(made, rng):
     """Rows of the claims by their first words and network."""
 
-    def judge(**options: object) -> dict[tuple[str, str], ClaimRow]:
-        results = as_the_thesis(made(Made(**options)))  # pyright: ignore[reportArgumentType]
+    def judge(**options: object) -> dict[tuple[str, str], verdict.ClaimRow]:
+        results = made(Made(as_run="-thesis", **options))  # pyright: ignore[reportArgumentType]
         return {(row.claim, row.subject): row for row in BENCHMARK.judge_claims(results, results, rng=rng)}
 
     return judge
@@ -119,7 +77,7 @@ def test_two_markers_pass_in_an_additive_game_where_they_hold_over_half(judged, 
 
 
 def test_the_record_of_the_package_has_every_kind_of_claim():
-    record = load_thesis()
+    record = verdict.load_thesis()
     assert [point.shift_px for point in record.shift] == [0.0, 0.25, 0.5, 1.0, 2.0]
     # raw images lose what difference images keep
     assert record.shift[-1].r2["raw"][0] < 0 < record.shift[-1].r2["difference"][0]
@@ -129,33 +87,21 @@ def test_the_record_of_the_package_has_every_kind_of_claim():
     assert {row.input for row in record.methods} == {"difference", "raw"}
 
 
-@pytest.mark.parametrize(
-    ("outcomes", "joined"),
-    [
-        (["holds", "holds"], "holds"),
-        (["holds", "undecided"], "undecided"),
-        (["holds", "undecided", "does not hold"], "does not hold"),
-        ([], "undecided"),
-    ],
-)
-def test_outcomes_join(outcomes, joined):
-    assert BENCHMARK.all_of(outcomes) == joined
+def test_outcomes_join():
+    assert BENCHMARK.all_of(["holds", "holds"]) == "holds"
+    assert BENCHMARK.all_of(["holds", "undecided"]) == BENCHMARK.all_of([]) == "undecided"
+    assert BENCHMARK.all_of(["holds", "undecided", "does not hold"]) == "does not hold"
 
 
 def test_too_few_trials_decide_nothing_and_one_has_no_interval():
-    assert judge_gap(Difference(estimate=1.0, low=0.9, high=1.1, units=3)) == "undecided"
+    assert verdict.judge_gap(Difference(estimate=1.0, low=0.9, high=1.1, units=3)) == "undecided"
     gap = Difference(estimate=1.0, low=None, high=None, units=1)
-    assert judge_gap(gap) == "undecided"
-    assert write_gap(gap) == "+1.000 (no interval of one trial)"
+    assert verdict.judge_gap(gap) == "undecided"
+    assert verdict.write_gap(gap) == "+1.000 (no interval of one trial)"
 
 
 def status(results: Results) -> dict[tuple[str, str], str]:
-    return {(row.input, row.method): row.status for row in judge_study(results)}
-
-
-def without_truth(results: Results) -> Results:
-    """Results of a study whose scenes cannot be drawn anew."""
-    return replace(results, truth={})
+    return {(row.input, row.method): row.status for row in verdict.judge_study(results)}
 
 
 # the control has 0.1, and intervals reach 0.05 either way
@@ -163,12 +109,13 @@ def without_truth(results: Results) -> Results:
 def test_a_method_is_ahead_or_behind_beyond_the_interval_over_the_best_control(made, value, expected):
     results = made(Made(spearman=SPEARMAN | {"poly-cam": value}))
     assert status(results)["raw", "poly-cam"] == expected
-    scores = [float(row.score.split()[0].replace("\N{MINUS SIGN}", "-")) for row in judge_study(results)]
+    scores = [float(row.score.split()[0].replace("\N{MINUS SIGN}", "-")) for row in verdict.judge_study(results)]
     assert scores[: len(SPEARMAN)] == sorted(scores[: len(SPEARMAN)], reverse=True)
 
 
 def test_without_truth_a_method_is_ahead_where_it_beats_the_controls_under_most_fills(made):
-    rows = status(without_truth(made(Made(gains=GAINS | {"integrated-gradients": 0.4}))))
+    results = made(Made(gains=GAINS | {"integrated-gradients": 0.4}))
+    rows = status(replace(results, truth={}))
     of_input = {method: judged for (name, method), judged in rows.items() if name == "difference"}
     assert of_input == {"integrated-gradients": "ahead", "poly-cam": "ahead", "grad-cam": "behind"}
 
@@ -178,12 +125,12 @@ def test_a_fill_votes_once_and_not_where_it_cannot_tell_the_truth(made):
     faithful, truth = study.faithfulness["difference"], study.truth["difference"]
     # the untouched frame was tried by pixel and by marker
     every = [("reference", "pixel"), ("grey", "pixel"), ("blur", "pixel"), ("true", "marker")]
-    assert voting_settings(faithful) == voting_settings(faithful, truth) == every
+    assert verdict.voting_settings(faithful) == verdict.voting_settings(faithful, truth) == every
     (meta,) = truth.meta
     assert meta.gap is not None
     # ahead by its mean, but not for sure
     unsure = replace(meta, fill="grey", gap=replace(meta.gap, low=-0.01))
-    assert voting_settings(faithful, replace(truth, meta=(meta, unsure))) == [every[0], *every[2:]]
+    assert verdict.voting_settings(faithful, replace(truth, meta=(meta, unsure))) == [every[0], *every[2:]]
 
 
 def with_r2(results: Results, r2: float) -> Results:
@@ -196,12 +143,12 @@ def with_r2(results: Results, r2: float) -> Results:
 
 def test_a_network_that_predicts_badly_gets_no_verdict_and_a_worse_one_no_map(made):
     results = made()
-    assert why_no_verdict(results, "raw") is None
+    assert verdict.why_no_verdict(results, "raw") is None
     unsure = with_r2(results, 0.6)
     assert {value for (name, _), value in status(unsure).items() if name == "raw"} == {"no verdict"}
     assert "ahead" in {value for (name, _), value in status(unsure).items() if name == "difference"}
-    assert without_weak(unsure) == (unsure, ())
-    shown, sentences = without_weak(with_r2(results, 0.4))
+    assert verdict.without_weak(unsure) == (unsure, ())
+    shown, sentences = verdict.without_weak(with_r2(results, 0.4))
     assert not [name for name in shown.explanations if name == "raw"]
     assert set(shown.truth) == {"difference"}
     assert "raw images are not shown" in sentences[0]
@@ -209,10 +156,10 @@ def test_a_network_that_predicts_badly_gets_no_verdict_and_a_worse_one_no_map(ma
 
 def test_too_few_trials_decide_nothing_and_the_page_says_so_first(made):
     results = made(Made(trials=3))
-    for each in (results, without_truth(results)):
+    for each in (results, replace(results, truth={})):
         assert set(status(each).values()) == {"no verdict"}
-    assert cautions(results)[0].startswith("This study explains 3 trials, and fewer than 5 decide")
-    assert "5 are needed" in build_opening(results, judge_study(results)).answer
+    assert verdict.cautions(results)[0].startswith("This study explains 3 trials, and fewer than 5 decide")
+    assert "5 are needed" in build_opening(results, verdict.judge_study(results)).answer
 
 
 def test_frames_that_are_left_out_of_the_scores_are_named(made):
@@ -229,21 +176,21 @@ def test_frames_that_are_left_out_of_the_scores_are_named(made):
 def test_an_unsound_sample_is_named_before_the_verdict(made, sound):
     results = made(Made(sound=sound))
     both = "off by 7 points (difference images) and 13 points (raw images) on average"
-    assert any(both in caution for caution in cautions(results)) is not sound
+    assert any(both in caution for caution in verdict.cautions(results)) is not sound
 
 
 def test_the_answer_names_what_is_ahead_and_what_is_not():
-    def row(method: str, status: str) -> MethodRow:
-        return MethodRow(input="raw", method=method, score="", control="", lead="", status=status)  # pyright: ignore[reportArgumentType]
+    def row(method: str, status: str) -> verdict.MethodRow:
+        return verdict.MethodRow(input="raw", method=method, score="", control="", lead="", status=status)  # pyright: ignore[reportArgumentType]
 
-    both = answer_trust([row("poly-cam", "ahead"), row("grad-cam", "behind")], ())
+    both = verdict.answer_trust([row("poly-cam", "ahead"), row("grad-cam", "behind")], ())
     assert both.startswith("Raw images: yes, Poly-CAM; no, Grad-CAM")
-    assert answer_trust([row("poly-cam", "tied")], ()).startswith("Raw images: no;")
-    assert answer_trust([row("poly-cam", "no verdict")], ["why"]) == "Raw images: not known. Why."
+    assert verdict.answer_trust([row("poly-cam", "tied")], ()).startswith("Raw images: no;")
+    assert verdict.answer_trust([row("poly-cam", "no verdict")], ["why"]) == "Raw images: not known. Why."
 
 
 def test_without_scores_nothing_is_believed(tmp_path: Path):
     write_choice(tmp_path, Made())
     results = load_results(tmp_path)
-    assert judge_study(results) == ()
+    assert verdict.judge_study(results) == ()
     assert build_opening(results, ()).answer.startswith("Not known")

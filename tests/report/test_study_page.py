@@ -14,12 +14,7 @@ from sliplens.results.study import CONFIG_FILE, StudyConfig
 
 from .study_results import Made, write_choice
 
-THESIS_FIGURES = {
-    "fig-07-mse-by-bin",
-    "fig-09-faithfulness",
-    "fig-15-methods-difference",
-    "fig-16-methods-raw",
-}
+THESIS_FIGURES = {"fig-07-mse-by-bin", "fig-09-faithfulness", "fig-15-methods-difference", "fig-16-methods-raw"}
 STAGES = ("faithfulness", "map-quality", "truth")
 
 

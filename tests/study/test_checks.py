@@ -13,7 +13,7 @@ from sliplens.explainers.table import get_explainer
 from sliplens.faithfulness.controls import cascade, total_variation
 from sliplens.faithfulness.scoring import influences
 from sliplens.recordings import Dataset
-from sliplens.results.explanation import MethodNotes
+from sliplens.results.explanation import Explanation, MethodNotes
 from sliplens.results.faithfulness import NEW_WEIGHTS
 from sliplens.results.study import Setting, StudyConfig
 from sliplens.study.choice import Material
@@ -35,18 +35,11 @@ class ShowsTheImage:
         )
 
 
-def with_image(material: Material, explainer: ShowsTheImage) -> Material:
-    """The material with one more method, whose maps are the images, turned to each frame's target."""
-    shown = (material.inputs.mean(dim=1).numpy() * material.explained.towards[:, None, None]).astype(np.float32)
-    return replace(
-        material,
-        explained=replace(
-            material.explained,
-            methods={"image": MethodNotes(seconds_per_frame=0.0, warnings=()), **material.explained.methods},
-            relevance={"image": shown, **material.explained.relevance},
-        ),
-        explainers={"image": explainer, **material.explainers},
-    )
+def with_map(explained: Explanation, name: str, relevance: np.ndarray, *, raises_only: bool = False) -> Explanation:
+    """The explanation with maps of one more method."""
+    notes = MethodNotes(seconds_per_frame=0.0, warnings=(), raises_only=raises_only)
+    methods, maps = {**explained.methods, name: notes}, {**explained.relevance, name: relevance.astype(np.float32)}
+    return replace(explained, methods=methods, relevance=maps)
 
 
 def test_the_untrained_controls_leave_the_network_as_it_is_and_depend_on_the_seed(material: Material):
@@ -82,10 +75,7 @@ def test_a_map_of_what_raises_the_answer_ranks_by_its_order_and_is_held_against_
     first, *others = explained.frames
     fell = replace(first, prediction=first.reference_prediction - 0.3)
     rose = [replace(one, prediction=one.reference_prediction + 0.3) for one in others]
-    notes = MethodNotes(seconds_per_frame=0.0, warnings=(), raises_only=True)
-    methods, maps = {**explained.methods, name: notes}, {**explained.relevance, name: relevance}
-    explained = replace(explained, frames=(fell, *rose), methods=methods, relevance=maps)
-    explainers = {**material.explainers, name: get_explainer(name)}
+    explained = with_map(replace(explained, frames=(fell, *rose)), name, relevance, raises_only=True)
     records = Records(
         folder=Path("nowhere"),
         data=fine_dataset,
@@ -93,7 +83,7 @@ def test_a_map_of_what_raises_the_answer_ranks_by_its_order_and_is_held_against_
         config=StudyConfig(),
         network="difference",
     )
-    own = replace(material, explained=explained, explainers=explainers)
+    own = replace(material, explained=explained, explainers={**material.explainers, name: get_explainer(name)})
     control = {f"{name}{NEW_WEIGHTS}": relevance}
     vars(records).update(material=own, influence={**influences(own.trained, own.explained), **control})
     # parts are removed in the published order
@@ -106,18 +96,18 @@ def test_a_map_of_what_raises_the_answer_ranks_by_its_order_and_is_held_against_
 
 
 def test_a_method_that_ignores_the_weights_shows_nothing_about_the_network(material: Material):
-    shows_the_image = with_image(material, ShowsTheImage())
-    small = replace(shows_the_image, explainers={"image": ShowsTheImage()})
+    image = material.inputs.mean(dim=1).numpy() * material.explained.towards[:, None, None]
+    explained = with_map(material.explained, "image", image)
+    small = replace(material, explained=explained, explainers={"image": ShowsTheImage()})
     maps = {**influences(small.trained, small.explained), **Untrained(material=small).make().maps}
     np.testing.assert_allclose(maps["image-new-weights"], maps["image"], atol=1e-6)
     grey = (Setting(fill="grey", unit="pixel"),)
-    scored = Removal(
-        trained=small.trained, explained=small.explained, units=small.units(), maps=maps, settings=grey, random_orders=1
-    ).make()
+    stage = Removal(trained=small.trained, explained=explained, units=small.units(), maps=maps, settings=grey)
+    scored = replace(stage, random_orders=1).make()
     (lead,) = [score.lead_over_controls for score in scored.scores if score.method == "image"]
     assert lead is not None
     assert ends_of(lead.gap)[1] <= 0
-    assert not lead.shows_something
+    assert not lead.gap.above_zero
 
 
 def test_looks_are_those_of_the_saved_maps(material: Material):

@@ -1,3 +1,5 @@
+"""Trials, frames, markers and methods of a study."""
+
 from dataclasses import replace
 
 import numpy as np
@@ -5,17 +7,22 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from sliplens.codec import load_result, save_result
 from sliplens.errors import InputError, RecordingError
+from sliplens.explainers.explain import with_markers
 from sliplens.models import Network
 from sliplens.recordings import Dataset
 from sliplens.results.explanation import Explanation
-from sliplens.results.study import Choice, StudyConfig
-from sliplens.study.choice import Material, choose_frames, worth_scoring
+from sliplens.results.study import Choice, States, StudyConfig
+from sliplens.study import choice as choosing
+from sliplens.study.choice import Material, choose_frames, study_explainers, worth_scoring
 from sliplens.study.run import load_networks
+
+from .conftest import marker_table
 
 
 class Says(nn.Module):
-    """A network that always gives the same answer, or the mean brightness of a trial's frames times a factor."""
+    """A network that always gives the same answer."""
 
     def __init__(self, answer: float) -> None:
         super().__init__()
@@ -79,7 +86,6 @@ def test_of_two_networks_the_worse_decides(network: Network, fine_dataset: Datas
     assert choose_frames(networks, fine_dataset, StudyConfig(tolerance=0.6)).qualified == 0
     assert choose_frames(networks, fine_dataset, StudyConfig(tolerance=0.95)).qualified == 3
     found = choose_frames(networks, fine_dataset, StudyConfig(tolerance=0.6))
-    assert found.qualified_alone == {"difference": 3, "raw": 0}
     # scored are 40, 20 and 0 %: 0.5 is off by 0.3 on average, 0.9 by 0.7, and labels lie within 1/39 of a level
     assert found.mean_error == pytest.approx({"difference": 0.3, "raw": 0.7}, abs=1 / 39)
     told = [f"{100 * found.mean_error[name]:.0f} points ({name} images)" for name in networks]
@@ -90,31 +96,74 @@ def test_where_too_few_qualify_the_text_says_what_was_done(network: Network, fin
     found = choose_frames({"difference": says(network, 0.5)}, fine_dataset, StudyConfig(trials=5, tolerance=0.01))
     assert "3 of 5 wanted were taken: 0 are predicted within 5 points" in found.summary
     assert found.close == 0
-    assert (found.sound, found.qualified_alone) == (False, {"difference": 0})
+    assert not found.sound
     enough = choose_frames({"difference": says(network, 0.5)}, fine_dataset, StudyConfig(trials=2, tolerance=0.9))
     assert [one.trial for one in enough.trials] == ["test-dry-0", "test-dry-1"]
 
 
-@pytest.mark.parametrize(
-    ("change", "sentence"),
-    [
-        ({"trials": 0}, "0 trials is impossible"),
-        ({"tolerance": 2.0}, "between 0 and 1"),
-    ],
-)
-def test_impossible_wishes_are_refused(
-    network: Network, fine_dataset: Dataset, change: dict[str, object], sentence: str
-):
-    with pytest.raises(InputError, match=sentence):
-        choose_frames({"difference": network}, fine_dataset, StudyConfig(**change))  # pyright: ignore[reportArgumentType]
-
-
-def test_data_without_frames_near_the_levels_are_refused(network: Network, small_dataset: Dataset):
+def test_an_impossible_study_is_refused(network: Network, fine_dataset: Dataset, small_dataset: Dataset):
+    for config, sentence in (
+        (StudyConfig(trials=0), "0 trials is impossible"),
+        (StudyConfig(tolerance=2.0), "between 0 and 1"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            choose_frames({"difference": network}, fine_dataset, config)
     # its labels are elevenths: none lies within 5 % of full stick
     with pytest.raises(RecordingError, match="choose another split or condition"):
         choose_frames({"difference": network}, small_dataset, StudyConfig())
-
-
-def test_a_study_without_a_network_is_refused():
     with pytest.raises(InputError, match="needs a network"):
         load_networks([])
+
+
+def test_a_trial_without_markers_is_named_and_the_result_comes_back(choice: Choice, fine_dataset: Dataset, tmp_path):
+    states = choosing.show_states(choice, fine_dataset)
+    save_result(states, tmp_path)
+    back = load_result(tmp_path, States, command="sliplens study")
+    for one in (states, back):
+        assert len(one.untracked) == 2
+        assert one.markers == {}
+
+
+def test_a_marker_stands_halfway_and_scales_with_the_image():
+    # a grid of pitch 20 that moved by 4 to the right, seen at half the size: edges stay edges, centres by half a pixel
+    x, y = np.meshgrid(np.arange(10, 100, 20.0), np.arange(10, 100, 20.0))
+    rest = np.stack([x.ravel(), y.ravel()], axis=1)
+    markers = marker_table(rest, rest + np.array([4.0, 0.0]))
+    centres, reach = choosing.network_places(markers, frame_size=(100, 100), image_size=50)
+    np.testing.assert_allclose(centres, (rest + np.array([2.0, 0.0]) + 0.5) / 2 - 0.5)
+    assert reach == pytest.approx(5.0)
+
+
+def test_markers_that_were_lost_are_left_out():
+    rest = np.array([[10.0, 10.0], [30.0, 10.0], [50.0, 10.0]])
+    now = rest.copy()
+    now[1] = np.nan
+    centres, reach = choosing.network_places(marker_table(rest, now), frame_size=(60, 60), image_size=60)
+    np.testing.assert_allclose(centres, rest[[0, 2]])
+    assert reach == pytest.approx(20.0)
+
+
+def test_markers_are_told_by_frame_and_asked_once_where_they_are_needed():
+    images, asked = torch.rand(3, 3, 8, 8, generator=torch.Generator().manual_seed(0)), []
+
+    def find():
+        asked.append(1)
+        return [torch.full((2, 2), float(row)) for row in range(3)]
+
+    table = with_markers(study_explainers(("shapley-marker", "occlusion-marker", "occlusion")), images, find)
+    assert len(asked) == 1
+    for row, image in enumerate(images):
+        # noise, or one pixel of the next frame, leaves an image what it is
+        near = image + 0.05 * torch.rand(3, 8, 8, generator=torch.Generator().manual_seed(1))
+        assert all(
+            float(vars(table[name])["markers_px"](near, images[0]).mean()) == row
+            for name in ("shapley-marker", "occlusion-marker")
+        )
+    with_markers(study_explainers(("occlusion", "grad-cam")), images, find)
+    assert len(asked) == 1
+
+
+def test_without_markers_tiles_are_asked():
+    named = choosing.without_markers(study_explainers(("poly-cam", "shapley-marker")))
+    assert list(named) == ["poly-cam", "shapley"]
+    assert vars(named["shapley"])["markers_px"] is None

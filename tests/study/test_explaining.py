@@ -1,5 +1,7 @@
 """`explain` of a data set: its folder, interrupted and continued, in other processes, and damaged."""
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,24 +11,24 @@ from sliplens.errors import InputError
 from sliplens.explainers.explain import network_inputs
 from sliplens.explainers.frames import FrameSelection
 from sliplens.files import output_folder
-from sliplens.models import Network, load
+from sliplens.models import Network
 from sliplens.recordings import Dataset
 from sliplens.results.explanation import Explanation, load_explanation
 from sliplens.study.explaining import explain
 
 METHODS = ("grad-cam", "integrated-gradients")
-SELECT = FrameSelection(levels=(1.0, 0.0))
+MakeMaps = Callable[..., Explanation]
 
 
 @pytest.fixture(scope="module")
-def trained(difference_run: Path) -> Network:
-    return load(difference_run)
+def explain_all(network: Network, small_dataset: Dataset) -> MakeMaps:
+    return partial(explain, network, small_dataset, method=METHODS, select=FrameSelection(levels=(1.0, 0.0)))
 
 
 @pytest.fixture(scope="module")
-def folder(trained: Network, small_dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(explain_all: MakeMaps, tmp_path_factory: pytest.TempPathFactory) -> Path:
     target = tmp_path_factory.mktemp("explained") / "maps"
-    explain(trained, small_dataset, method=METHODS, select=SELECT, out=target)
+    explain_all(out=target)
     return target
 
 
@@ -39,29 +41,20 @@ def require_same(first: Explanation, second: Explanation) -> None:
         np.testing.assert_array_equal(first.saliency[method], second.saliency[method])
 
 
-def test_a_folder_holds_the_record_that_is_returned_without_one(trained: Network, small_dataset: Dataset, folder: Path):
+def test_a_folder_holds_the_record_that_is_returned_without_one(explain_all: MakeMaps, network: Network, folder: Path):
     progress = []
-    explanation = explain(
-        trained, small_dataset, method=METHODS, select=SELECT, on_progress=lambda *step: progress.append(step)
-    )
+    explanation = explain_all(on_progress=lambda *step: progress.append(step))
     assert progress[-1] == (4, 4)
     saved = load_explanation(folder)
     require_same(saved, explanation)
     assert list(saved.methods) == list(METHODS)
-    predictions = trained.predict(network_inputs(trained, saved)).numpy()
+    predictions = network.predict(network_inputs(network, saved)).numpy()
     np.testing.assert_allclose([frame.prediction for frame in saved.frames], predictions, atol=1e-6)
 
 
-def test_a_complete_folder_is_read_and_not_made_again(folder: Path, trained: Network, small_dataset: Dataset):
+def test_a_complete_folder_is_read_and_not_made_again(explain_all: MakeMaps, folder: Path):
     progress = []
-    again = explain(
-        trained,
-        small_dataset,
-        method=METHODS,
-        select=SELECT,
-        out=folder,
-        on_progress=lambda *step: progress.append(step),
-    )
+    again = explain_all(out=folder, on_progress=lambda *step: progress.append(step))
     assert not progress
     assert again.methods == load_explanation(folder).methods
 
@@ -70,59 +63,41 @@ def part_times(parts: Path) -> dict[str, int]:
     return {path.parent.name: path.stat().st_mtime_ns for path in parts.rglob("arrays.npz")}
 
 
-def test_an_interrupted_explanation_continues_after_the_last_map(
-    trained: Network, small_dataset: Dataset, folder: Path, tmp_path: Path
-):
+def test_an_interrupted_explanation_continues_after_the_last_map(explain_all: MakeMaps, folder: Path, tmp_path: Path):
     def interrupt(done: int, total: int) -> None:
         assert total == 4
         if done == 3:
             raise KeyboardInterrupt
 
-    out = tmp_path / "maps"
+    out, parts = tmp_path / "maps", tmp_path / ".maps.partial" / "parts"
     with pytest.raises(KeyboardInterrupt):
-        explain(trained, small_dataset, method=METHODS, select=SELECT, out=out, on_progress=interrupt)
-    parts = tmp_path / ".maps.partial" / "parts"
+        explain_all(out=out, on_progress=interrupt)
     before = part_times(parts)
     assert len(before) == 3
     after: dict[str, int] = {}
-    explain(
-        trained,
-        small_dataset,
-        method=METHODS,
-        select=SELECT,
-        out=out,
-        on_progress=lambda *_: after.update(part_times(parts)),
-    )
+    explain_all(out=out, on_progress=lambda *_: after.update(part_times(parts)))
     assert before.items() <= after.items()  # the three maps were not made again
     require_same(load_explanation(out), load_explanation(folder))
 
 
 def test_a_failure_after_the_last_map_loses_none(
-    trained: Network, small_dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    explain_all: MakeMaps, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     def fail(*_: object, **__: object) -> None:
         raise OSError("no space left on device")
 
     out = tmp_path / "maps"
-    for name, error in (
-        ("sliplens.study.explaining.draw_explanation", OSError),
-        ("sliplens.explainers.cam.capture", None),
-    ):
-        with monkeypatch.context() as patch:
-            patch.setattr(name, fail)
-            if error is None:  # no map is made again
-                assert len(explain(trained, small_dataset, method="grad-cam", select=SELECT, out=out).frames) == 2
-            else:
-                with pytest.raises(error, match="no space left"):
-                    explain(trained, small_dataset, method="grad-cam", select=SELECT, out=out)
+    with monkeypatch.context() as patch:
+        patch.setattr("sliplens.study.explaining.draw_explanation", fail)
+        with pytest.raises(OSError, match="no space left"):
+            explain_all(method="grad-cam", out=out)
+    monkeypatch.setattr("sliplens.explainers.cam.capture", fail)  # no map is made again
+    assert len(explain_all(method="grad-cam", out=out).frames) == 2
     assert not (out / "parts").exists()
 
 
-def test_maps_are_the_same_in_another_process(
-    trained: Network, small_dataset: Dataset, folder: Path, tmp_path: Path, elsewhere: str
-):
-    found = explain(trained, small_dataset, method=METHODS, select=SELECT, out=tmp_path / "maps", on=elsewhere)
-    require_same(found, load_explanation(folder))
+def test_maps_are_the_same_in_another_process(explain_all: MakeMaps, folder: Path, tmp_path: Path, elsewhere: str):
+    require_same(explain_all(out=tmp_path / "maps", on=elsewhere), load_explanation(folder))
 
 
 def test_a_folder_of_another_stage_is_refused(tmp_path: Path):

@@ -3,12 +3,8 @@
 import numpy as np
 import pytest
 
-from sliplens.study.neutral import (
-    correlate_groups,
-    draw_groups,
-    marker_sums,
-    neutral_frame,
-)
+from sliplens.study.choice import marker_sums
+from sliplens.study.truth import correlate_groups, draw_groups, neutral_frame
 
 MARKERS = 40
 

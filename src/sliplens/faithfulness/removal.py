@@ -1,7 +1,6 @@
 """Removal curves: change of the prediction while the most, the least and random parts of an image are removed."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import TypeAlias
 
@@ -62,27 +61,24 @@ def influence_orders(influence: Float[np.ndarray, "images markers"]) -> Int[np.n
     return np.stack([np.argsort(sign * influence, axis=-1, kind="stable") for sign in (-1, 1)])
 
 
-@dataclass(frozen=True, kw_only=True)
-class RemovalCurves:
-    """Answers of a network while parts of an image are removed in several orders."""
+def lost_evidence(
+    answers: Float[np.ndarray, "orders images steps"], towards: Float[np.ndarray, " images"]
+) -> Float64[np.ndarray, "orders images steps"]:
+    """Changes along the sign of f(x) - f(baseline): how much of the supporting evidence is removed."""
+    return towards[:, None] * (answers[..., :1] - answers)
 
-    areas: Float64[np.ndarray, " steps"]
-    """Share of the image that is gone at each step, from 0 to 1."""
-    answers: Float64[np.ndarray, "orders images steps"]
-    """Answers in margin units; at step 0 those on the whole images."""
 
-    def lost(self, towards: Float[np.ndarray, " images"]) -> Float64[np.ndarray, "orders images steps"]:
-        """Changes along the sign of f(x) - f(baseline): how much of the supporting evidence is removed."""
-        return towards[:, None] * (self.answers[..., :1] - self.answers)
-
-    def by_method(self, names: Iterable[str], *, towards: Float[np.ndarray, " images"]) -> dict[str, RemovalCurve]:
-        """Name the curves: most, then least influential first for each method, then the random orders."""
-        names, changes = list(names), self.lost(towards)
-        pairs, random = changes[: 2 * len(names)].reshape(-1, 2, *changes.shape[1:]), changes[2 * len(names) :]
-        return {
-            name: RemovalCurve(areas=self.areas, most_first=most, least_first=least, random=random.mean(axis=0))
-            for name, (most, least) in zip(names, pairs, strict=True)
-        }
+def _name_curves(
+    names: Iterable[str], lost: Float64[np.ndarray, "orders images steps"], areas: Sequence[float]
+) -> dict[str, RemovalCurve]:
+    """Name the curves: most, then least influential first for each method, then the random orders."""
+    names, shares = list(names), np.asarray(areas, dtype=np.float64)
+    pairs, random = lost[: 2 * len(names)].reshape(-1, 2, *lost.shape[1:]), lost[2 * len(names) :]
+    mean = random.mean(axis=0) if len(random) else np.zeros(lost.shape[1:])
+    return {
+        name: RemovalCurve(areas=shares, most_first=most, least_first=least, random=mean)
+        for name, (most, least) in zip(names, pairs, strict=True)
+    }
 
 
 def _as_engine(predict: Predict) -> Engine:
@@ -132,8 +128,8 @@ def removal_curves(
     references: Float[Tensor, "images colours height width"] | None = None,
     areas: Sequence[float] = AREAS,
     seed: int = 0,
-) -> RemovalCurves:
-    """Predict inputs while parts of them are removed, in several orders each.
+) -> Float64[np.ndarray, "orders images areas"]:
+    """Predict inputs, whole and while parts of them are removed, in several orders each.
 
     Inputs are in [0, 1], as the references, those of the baseline, where the fill needs them. Orders are flat
     pixel indices, first to be removed first (`unit_order`); areas are shares of the image, rising from 0 to 1.
@@ -163,7 +159,7 @@ def removal_curves(
     answers[order_of, image_of, step_of] = _answer(engine, batches, count)
     answers[:, :, 0] = answer_whole(engine, images)
     answers[:, :, -1] = answers[0, :, -1]
-    return RemovalCurves(areas=shares, answers=answers)
+    return answers
 
 
 def score_maps(
@@ -180,7 +176,7 @@ def score_maps(
     areas: Sequence[float] = AREAS,
     seed: int = 0,
 ) -> dict[str, RemovalCurve]:
-    """Score the maps of several methods on the same images, against the same random orders.
+    """Score the maps of several methods on the same images, against the same random orders, if any.
 
     Of signed relevance give the part that works towards the target; changes count along `towards`, the sign of
     f(x) - f(baseline) of each image.
@@ -194,8 +190,10 @@ def score_maps(
         for least in (False, True)
     ]
     orders += [np.stack([random_unit_order(unit, rng=rng) for unit in units]) for _ in range(random_orders)]
-    curves = removal_curves(predict, images, np.stack(orders), fill=fill, references=references, areas=areas, seed=seed)
-    return curves.by_method(influence, towards=towards)
+    answers = removal_curves(
+        predict, images, np.stack(orders), fill=fill, references=references, areas=areas, seed=seed
+    )
+    return _name_curves(influence, lost_evidence(answers, towards), areas)
 
 
 def answer_scenes(
@@ -217,20 +215,22 @@ def answer_scenes(
     return answer
 
 
-def marker_curves(predict: Predict, redraw: Redraw, orders: Int[np.ndarray, "orders images markers"]) -> RemovalCurves:
+def marker_curves(
+    predict: Predict, redraw: Redraw, orders: Int[np.ndarray, "orders images markers"]
+) -> Float64[np.ndarray, "orders images shares"]:
     """Predict frames while `SHARES` of their markers are put back, in several orders each.
 
     Scenes that several orders share are drawn once.
     """
-    areas, (_, images, markers) = np.asarray(SHARES), orders.shape
-    counts = np.round(areas * markers).astype(np.int64)
-    answers = np.empty((len(orders), images, len(areas)))
+    _, images, markers = orders.shape
+    counts = np.round(np.asarray(SHARES) * markers).astype(np.int64)
+    answers = np.empty((len(orders), images, len(counts)))
     for image in report_each(range(images)):
         rank = np.argsort(orders[:, image], axis=-1)
         back = rank[:, None] < counts[:, None]
         answer = answer_scenes(predict, partial(redraw, image))
         answers[:, image] = answer(back.reshape(-1, markers)).reshape(back.shape[:2])
-    return RemovalCurves(areas=areas, answers=answers)
+    return answers
 
 
 def score_maps_by_marker(
@@ -248,6 +248,6 @@ def score_maps_by_marker(
             raise InputError(f"{name} gives some marker no finite influence; leave out markers that no pixel shows")
     orders = [influence_orders(values) for values in influence.values()]
     images, markers = orders[0].shape[1:]
-    by_chance = [[rng.permutation(markers) for _ in range(images)] for _ in range(random_orders)]
-    curves = marker_curves(predict, redraw, np.concatenate([*orders, np.array(by_chance)]))
-    return curves.by_method(influence, towards=towards)
+    orders += [np.array([[rng.permutation(markers) for _ in range(images)]]) for _ in range(random_orders)]
+    answers = marker_curves(predict, redraw, np.concatenate(orders))
+    return _name_curves(influence, lost_evidence(answers, towards), SHARES)

@@ -1,7 +1,7 @@
 """Scores of explanations: removal under several fills, the deletion score of the thesis, and alarms."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -11,29 +11,18 @@ from torch import Tensor
 from sliplens.errors import CheckpointError, InputError, SaliencyError
 from sliplens.explainers.explain import join_maps, network_inputs, network_references
 from sliplens.explainers.frames import frames_from_arrays
-from sliplens.faithfulness.controls import control_maps, lead_over_controls
+from sliplens.faithfulness.controls import Maps, control_maps, lead_over_controls
 from sliplens.faithfulness.fills import get_fill
 from sliplens.faithfulness.removal import Predict, removal_curves
 from sliplens.intervals import mean_interval, paired_difference
 from sliplens.models import Network
 from sliplens.models.engines import Engine, prepare
+from sliplens.results import faithfulness as records
 from sliplens.results.explanation import BASELINES, CLOSE, Explanation, MethodNotes, require_saliency
-from sliplens.results.faithfulness import (
-    CHANCE,
-    DeletionScores,
-    DeletionTable,
-    Faithfulness,
-    MethodScore,
-    RemovalCurve,
-    RemovalGap,
-    RemovalScore,
-    RemovalTable,
-    is_control,
-)
-from sliplens.results.study import Setting
+from sliplens.results.faithfulness import CHANCE, is_control
+from sliplens.results.study import REDRAWN, Setting
 
 Frames = UInt8[np.ndarray, "images height width 3"]
-Maps = Float[np.ndarray, "images height width"]
 _CHECKED_IMAGES = 4
 
 
@@ -50,12 +39,10 @@ def explanation_of_maps(
     Raises
     ------
     SaliencyError
-        If there is not a map a frame, or one has another size than the network's input, or holds NaN; or if a signed
-        array has no number below zero for a frame whose prediction fell.
+        If a map has another size than the network's input, or holds NaN; or if a signed array has no number below zero
+        for a frame whose prediction fell.
     """
     explanation = join_maps(network, frames_from_arrays(network, frames, reference), {})
-    if len(maps) != len(frames):
-        raise SaliencyError(f"there are {len(maps)} maps of {len(frames)} frames; explain the frames that are scored")
     for index, values in enumerate(maps):
         require_saliency(values, explanation.images.shape[-2:], where=f"map {index}")
     positive = (maps.min(axis=(1, 2)) >= 0) & (maps.max(axis=(1, 2)) > 0)
@@ -89,20 +76,8 @@ def influences(network: Network, explanation: Explanation) -> dict[str, Maps]:
     return maps | control_maps(network.model, inputs, references)
 
 
-@dataclass(frozen=True, kw_only=True)
-class SettingCurves:
-    """Curves of every map of some frames under one setting: most first, least first, random."""
-
-    areas: Float64[np.ndarray, " areas"]
-    curves: dict[str, Float64[np.ndarray, "3 frames areas"]]
-    whole: Float64[np.ndarray, " frames"]
-    """Predictions of the whole frames."""
-    blank: Float64[np.ndarray, " frames"]
-    """Predictions where all of the frame is removed; NaN where the setting has no fill."""
-
-
-def frame_columns(explanation: Explanation, steps: int) -> dict[str, np.ndarray]:
-    """Make the columns that name the frame of each row, for so many rows a frame."""
+def frame_columns(explanation: Explanation, steps: int | Sequence[int]) -> dict[str, np.ndarray]:
+    """Make the columns that name the frame of each row, for so many rows a frame, or for each frame its own number."""
     return {
         column: np.repeat([getattr(frame, name) for frame in explanation.frames], steps)
         for column, name in (("frame_id", "id"), ("day", "day"), ("trial", "trial"))
@@ -110,44 +85,49 @@ def frame_columns(explanation: Explanation, steps: int) -> dict[str, np.ndarray]
 
 
 def score_curves(
-    explanation: Explanation, curves: Mapping[Setting, SettingCurves], *, random_orders: int, seed: int
-) -> Faithfulness:
-    """Make the scores of the curves of all frames, by setting, with intervals over days and trials."""
+    explanation: Explanation,
+    curves: Mapping[Setting, Mapping[str, records.RemovalCurve]],
+    *,
+    random_orders: int,
+    seed: int,
+) -> records.Faithfulness:
+    """Make the scores of the curves of all frames, by setting and map, with intervals over days and trials."""
     rng, clusters, frames = np.random.default_rng(seed), explanation.clusters, explanation.frames
     labels = [np.nan if frame.safety_margin is None else frame.safety_margin for frame in frames]
     scores, comparisons, tables, gains = [], [], [], {}
-    for setting, part in curves.items():
+    for setting, of_setting in curves.items():
         where = {"fill": setting.fill, "unit": setting.unit}
-        gain = gains[setting] = {
-            name: RemovalCurve(areas=part.areas, most_first=most, least_first=least, random=random).symmetric_gain
-            for name, (most, least, random) in part.curves.items()
-        }
+        gain = gains[setting] = {name: curve.symmetric_gain for name, curve in of_setting.items()}
         controls = {name: values for name, values in gain.items() if is_control(name)}
         for name, values in gain.items():
             of_control, srg = name in controls, mean_interval(values, clusters=clusters, rng=rng)
             lead = None if of_control else lead_over_controls(values, controls, clusters=clusters, rng=rng)
-            scores.append(RemovalScore(**where, method=name, control=of_control, srg=srg, lead_over_controls=lead))
+            scores.append(
+                records.RemovalScore(**where, method=name, control=of_control, srg=srg, lead_over_controls=lead)
+            )
         for first, second in combinations([name for name in gain if name not in controls], 2):
             gap = paired_difference(gain[first], gain[second], clusters=clusters, rng=rng)
-            comparisons.append(RemovalGap(**where, first=first, second=second, gap=gap))
-        for name, (most, least, random) in part.curves.items():
-            rows, steps = most.size, len(part.areas)
+            comparisons.append(records.RemovalGap(**where, first=first, second=second, gap=gap))
+        for name, curve in of_setting.items():
+            rows, steps = curve.random.size, len(curve.areas)
             tables.append(
-                RemovalTable(
+                records.RemovalTable(
                     **{column: np.repeat(text, rows) for column, text in (where | {"method": name}).items()},
                     **frame_columns(explanation, steps),
                     safety_margin=np.repeat(labels, steps),
-                    area=np.tile(part.areas, len(frames)),
-                    most_first=most.ravel(),
-                    least_first=least.ravel(),
-                    random=random.ravel(),
+                    area=np.tile(curve.areas, len(frames)),
+                    **{column: getattr(curve, column).ravel() for column in ("most_first", "least_first", "random")},
                 )
             )
-    scale = explanation.scale
-    whole = next(iter(curves.values())).whole / scale
-    change = np.array([frame.prediction - frame.reference_prediction for frame in frames]) / scale
-    blank = {setting.fill: part.blank / scale for setting, part in curves.items() if np.isfinite(part.blank).all()}
-    return Faithfulness(
+    whole, empty = np.array([(frame.prediction, frame.reference_prediction) for frame in frames]).T / explanation.scale
+    # all parts are gone at the end of every curve; nothing is known of a frame without a direction
+    towards = np.where(explanation.towards == 0, np.nan, explanation.towards)
+    blank = {
+        setting.fill: whole - towards * next(iter(of_setting.values())).random[:, -1] / explanation.scale
+        for setting, of_setting in curves.items()
+        if setting != REDRAWN
+    }
+    return records.Faithfulness(
         input=explanation.input,
         source=explanation.source,
         unit=explanation.unit,
@@ -158,7 +138,7 @@ def score_curves(
         comparisons=tuple(comparisons),
         alarms=(
             *count_alarm(
-                np.abs(change) < CLOSE,
+                np.abs(whole - empty) < CLOSE,
                 f"next to nothing to explain in {{}} of {{}} frames: the answer lies within {CLOSE} of that on "
                 f"{BASELINES[explanation.baseline]}, less than networks err by, and the direction that a gain counts "
                 "along is chance; leave them out",
@@ -168,7 +148,7 @@ def score_curves(
             *(alarm for fill, gone in blank.items() for alarm in fill_decides(whole, gone, fill=fill)),
             *ranking_alarms({setting: {n: float(g.mean()) for n, g in of.items()} for setting, of in gains.items()}),
         ),
-        table=RemovalTable.joined(tables),
+        table=records.RemovalTable.joined(tables),
     )
 
 
@@ -202,15 +182,6 @@ def deletion_order(saliency: Float[np.ndarray, "height width"]) -> Int[np.ndarra
     array([1, 2, 3, 0])
     """
     return np.argsort(saliency.ravel(), kind="stable")[::-1].copy()
-
-
-def deletion_orders(explanation: Explanation, *, seed: int) -> dict[str, Int[np.ndarray, "frames pixels"]]:
-    """Compute the order of the pixels of each frame by method, most salient first, and a random one."""
-    rng, pixels = np.random.default_rng(seed), explanation.image_size**2
-    orders = {
-        name: np.stack([deletion_order(values) for values in maps]) for name, maps in explanation.saliency.items()
-    }
-    return orders | {CHANCE: np.stack([rng.permutation(pixels) for _ in explanation.frames])}
 
 
 def deletion_steps(shape: tuple[int, int], *, steps: int | None = None) -> Int[np.ndarray, " steps"]:
@@ -248,12 +219,12 @@ def delete_pixels(
     """
     removed = deletion_steps((images.shape[-2], images.shape[-1]), steps=steps)
     areas = [0.0, *removed / removed[-1]]
-    return removal_curves(predict, images, orders[None], fill=get_fill(fill), areas=areas).answers[0]
+    return removal_curves(predict, images, orders[None], fill=get_fill(fill), areas=areas)[0]
 
 
 def score_deletion(
     explanation: Explanation, answers: Mapping[str, Float64[np.ndarray, "frames answers"]], *, fill: str
-) -> DeletionScores:
+) -> records.DeletionScores:
     """Make the thesis's deletion scores of the predictions of all frames by method (`delete_pixels`)."""
     answers = {name: values / explanation.scale for name, values in answers.items()}
     frames, chance = len(explanation.frames), answers[CHANCE]
@@ -268,13 +239,13 @@ def score_deletion(
     scores = {name: deletion_score(values[:, :1], values[:, 1:]) for name, values in answers.items()}
     for name, values in scores.items():
         means, last = values.mean(axis=1), values[:, -1]
-        methods[name] = MethodScore(
+        methods[name] = records.MethodScore(
             mean=float(means.mean()), sd=float(means.std()), last_step_mean=float(last.mean()), frames=frames
         )
         if name != CHANCE:
             alarms += follows_last_step(means, last, name=f"D of {name}")
         tables.append(
-            DeletionTable(
+            records.DeletionTable(
                 method=np.repeat(name, frames * steps),
                 **frame_columns(explanation, steps),
                 step=np.tile(np.arange(steps), frames),
@@ -288,14 +259,14 @@ def score_deletion(
         for name, method in methods.items()
         if name != CHANCE and method.mean >= methods[CHANCE].mean
     ]
-    return DeletionScores(
+    return records.DeletionScores(
         input=explanation.input,
         source=explanation.source,
         fill=fill,
         steps=steps,
         methods=methods,
         alarms=tuple(alarms),
-        table=DeletionTable.joined(tables),
+        table=records.DeletionTable.joined(tables),
     )
 
 
@@ -342,11 +313,9 @@ def saturated(answers: Float[np.ndarray, " images"]) -> list[str]:
 
 
 def flat_maps(maps: Mapping[str, Float[np.ndarray, "images height width"]]) -> list[str]:
-    """Warn of constant maps and maps with NaN, which rank nothing."""
+    """Warn of constant maps, which rank nothing."""
     alarms = []
     for method, values in maps.items():
-        finite = np.all(np.isfinite(values), axis=(1, 2))
-        alarms += count_alarm(np.logical_not(finite), f"{method}: {{}} of {{}} maps hold NaN or infinity")
         flat = np.equal(values.max(axis=(1, 2)), values.min(axis=(1, 2)))
         alarms += count_alarm(flat, f"{method}: {{}} of {{}} maps are constant and rank nothing")
     return alarms

@@ -17,21 +17,13 @@ from markupsafe import Markup, escape
 from sliplens.codec import Result
 from sliplens.errors import InputError
 from sliplens.plots.style import written_whole
+from sliplens.report import sections
 from sliplens.report.plates import FOLDER, Plate, write_plates
-from sliplens.report.results import load_results
-from sliplens.report.sections import (
-    build_opening,
-    build_sections,
-    list_alarms,
-    missing_sections,
-    table_accuracy,
-    table_claims,
-)
 from sliplens.report.verdict import CITATION, cautions, judge_results, judge_study, without_weak
-from sliplens.results.study import Study
+from sliplens.results.study import Study, load_results
 
 PAGE = "report.html"
-VERDICT = "Networks compared with one another and on real touch, with 95 % intervals over days and trials."
+_VERDICT = "Networks compared with one another and on real touch, with 95 % intervals over days and trials."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,28 +80,24 @@ def write_report(
     results = load_results(folder)
     rng = np.random.default_rng(0)  # seeded: the same results give the same intervals
     results, weak = without_weak(results)
-    sections = build_sections(results)
-    rows = judge_study(results)
-    opening = build_opening(results, rows)
-    blocks = [*opening.blocks, *(block for section in sections for block in section.blocks)]
+    built = sections.build_sections(results)
+    opening = sections.build_opening(results, judge_study(results))
+    blocks = [*opening.blocks, *(block for section in built for block in section.blocks)]
     runs = list(results.runs.values())
     text = render_page(
-        "report.html.j2",
         name=results.folder.resolve().name,
         finished=runs[-1].finished[:16].replace("T", " at "),
         thesis=CITATION,
         waiting_for=waiting_for,
-        answer=opening.answer,
-        opening=opening.blocks,
-        next_step=opening.next_step,
+        opening=opening,
         verdict=[
-            *([table_accuracy(results)] if results.evaluations else []),
-            *([table_claims(VERDICT, claims)] if (claims := judge_results(results, rng=rng)) else []),
+            *([sections.table_accuracy(results)] if results.evaluations else []),
+            *([sections.table_claims(_VERDICT, claims)] if (claims := judge_results(results, rng=rng)) else []),
         ],
         cautions=[*weak, *cautions(results)],
-        alarms=list_alarms(results),
-        sections=[section for section in sections if section.blocks],
-        missing=missing_sections(results, sections),
+        alarms=sections.list_alarms(results),
+        sections=[section for section in built if section.blocks],
+        missing=sections.missing_sections(results, built),
         study=results.begun,
         runs=results.runs,
         recipes=[json.dumps(run.config, indent=2, ensure_ascii=False) for run in runs],
@@ -122,8 +110,8 @@ def write_report(
     return Written(page=page, figures=figures)
 
 
-def render_page(template: str, **values: Any) -> str:
-    """Fill a template of a page: every text is escaped, and only the style of the package works on it."""
+def render_page(**values: Any) -> str:
+    """Fill the template of the page: every text is escaped, and only the style of the package works on it."""
     loader = PackageLoader("sliplens.report")
     pages = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     # what stands between backticks is code
@@ -132,4 +120,4 @@ def render_page(template: str, **values: Any) -> str:
     code = b64encode(sha256(style.encode()).digest()).decode()
     allowed = "img-src data:", f"style-src 'sha256-{code}'", "base-uri 'none'", "form-action 'none'"
     policy = "; ".join(["default-src 'none'", *allowed])
-    return pages.get_template(template).render(policy=policy, style=style, **values)
+    return pages.get_template("report.html.j2").render(policy=policy, style=style, **values)

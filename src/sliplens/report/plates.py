@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,10 +15,10 @@ from sliplens.plots import charts, style
 from sliplens.plots.saliency import FrameU8, PictureRow, draw_pictures, full_points, overlay_points
 from sliplens.plots.sheets import TIMES, brighten, brightening
 from sliplens.plots.style import percent, reading_words
-from sliplens.report.results import Results
-from sliplens.report.verdict import ThesisRecord
+from sliplens.report.verdict import ThesisRecord, scores_by_condition
 from sliplens.results.explanation import BASELINES, Explanation, MovedMarkers, Strip
 from sliplens.results.faithfulness import DeletionScores, is_control
+from sliplens.results.study import Results
 
 FOLDER = "figures"
 """Beside the page."""
@@ -30,8 +30,6 @@ _FEW = 4  # charts in a row
 @dataclass(frozen=True, kw_only=True)
 class Plate:
     """A figure with its caption, its description in words, and for figures of the thesis its numbers."""
-
-    layout: ClassVar[str] = "plate"
 
     figure: Figure
     alt: str
@@ -136,14 +134,9 @@ def plate_moved(strip: Strip, moved: MovedMarkers) -> Plate:
 
 def plate_bins(results: Results) -> Plate:
     """Draw the MSE by bins of the margin, a chart a condition (thesis, Fig. 7)."""
-    evaluations, every = results.evaluations, (each.conditions for each in results.evaluations.values())
     bins = {
-        condition: {
-            name: evaluations[name].conditions[condition].bins
-            for name in style.inputs_in_order(evaluations)
-            if condition in evaluations[name].conditions
-        }
-        for condition in style.conditions_in_order(name for conditions in every for name in conditions)
+        condition: {name: score.bins for name, score in scores.items()}
+        for condition, scores in scores_by_condition(results).items()
     }
     rows = [
         (condition, name, score.low, score.high, score.frames, score.mse)
@@ -196,9 +189,10 @@ def plate_shift(record: ThesisRecord) -> Plate:
 def plate_deletion(scores: Mapping[str, DeletionScores]) -> Plate:
     """Draw the mean deletion score while pixels go, a chart an input, all of one source (thesis, Fig. 9)."""
     figure, axes = _make_charts(len(scores), each=(4.6, 3.5))
-    rows = []
+    names, rows = style.inputs_in_order(scores)[::-1], []
     with style.drawing_style():
-        for ax, (name, scored) in zip(axes, scores.items(), strict=True):
+        for ax, name in zip(axes, names, strict=True):
+            scored = scores[name]
             charts.plot_faithfulness(scored.curves, ax=ax).set_title(style.input_name(name))
             for method in style.methods_in_order(scored.curves):
                 curve = scored.curves[method]
@@ -211,7 +205,7 @@ def plate_deletion(scores: Mapping[str, DeletionScores]) -> Plate:
     return Plate(
         name="fig-09-faithfulness",
         figure=figure,
-        alt=f"Deletion score D against pixels removed: {style.listed([style.input_name(name) for name in scores])}",
+        alt=f"Deletion score D against pixels removed: {style.listed([style.input_name(name) for name in names])}",
         caption=f"Deletion score D of the thesis on {source} touch while pixels become {fill}, most "
         "salient first; the line is the mean over frames, the band holds the middle half of them. A curve that falls "
         "early names pixels the network relies on; at the right end every pixel is filled.",

@@ -2,15 +2,14 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Literal
 
 from sliplens.plots import style
 from sliplens.plots.style import fill_name, input_name, inputs_in_order, listed, name_methods
 from sliplens.report import plates, verdict
-from sliplens.report.results import Results
 from sliplens.results.explanation import BASELINES
 from sliplens.results.faithfulness import DeletionScores, Faithfulness, RemovalScore, is_control
-from sliplens.results.study import TESTS
+from sliplens.results.study import TESTS, Results
 
 Kind = Literal["name", "number", "best", "thesis", "outcome"]
 
@@ -26,8 +25,6 @@ class Cell:
 @dataclass(frozen=True, kw_only=True)
 class CellTable:
     """A table with its caption."""
-
-    layout: ClassVar[str] = "table"
 
     caption: str
     head: tuple[Cell, ...]
@@ -108,14 +105,8 @@ def table_claims(caption: str, rows: Sequence[verdict.ClaimRow]) -> CellTable:
 
 def table_accuracy(results: Results) -> CellTable:
     """Tabulate MSE, R2 and MAE by condition and input (thesis, Table 1)."""
-    evaluations = {name: results.evaluations[name] for name in style.inputs_in_order(results.evaluations)}
-    conditions = style.conditions_in_order(
-        name for evaluation in evaluations.values() for name in evaluation.conditions
-    )
-    rows = []
-    for condition in conditions:
-        scores = {name: each.conditions.get(condition) for name, each in evaluations.items()}
-        scores = {name: score for name, score in scores.items() if score}
+    evaluations, rows = results.evaluations, []
+    for condition, scores in verdict.scores_by_condition(results).items():
         lowest = min(score.mse for score in scores.values())
         for name, score in scores.items():
             mse, r2 = verdict.ACCURACY.get((name, condition), (None, None))
@@ -133,9 +124,9 @@ def table_accuracy(results: Results) -> CellTable:
                 )
             )
     text = "".join(
-        f" {style.input_name(name)}: the network was given the friction, {evaluation.friction}."
-        for name, evaluation in evaluations.items()
-        if evaluation.friction
+        f" {style.input_name(name)}: the network was given the friction, {evaluations[name].friction}."
+        for name in style.inputs_in_order(evaluations)
+        if evaluations[name].friction
     )
     return make_table(
         "Error of each network on test trials. MSE in squared margin units (Γ from 0 to 1), MAE in percentage points "
@@ -184,7 +175,7 @@ def _gain_cell(score: RemovalScore | None) -> Cell:
         return Cell(text=style.UNKNOWN)
     lead = score.lead_over_controls
     text = _two_lines(verdict.write_gap(score.srg)).replace("\n", "*\n" if score.srg.sure else "\n")
-    return _best(text, lead is not None and lead.shows_something)
+    return _best(text, lead is not None and lead.gap.above_zero)
 
 
 def table_properties(results: Results) -> CellTable:
@@ -279,6 +270,7 @@ def build_sections(results: Results) -> tuple[Section, ...]:
     baseline = next((BASELINES[each.baseline] for each in explained), BASELINES["untouched"])
     claims = "Claims of the thesis, its numbers, and ours with 95 % intervals over days and trials."
     thesis = verdict.load_thesis() if results.begun or results.strip is not None else None
+    scored = _names({*results.faithfulness, *results.deletion})
     return (
         Section(
             id="real",
@@ -306,7 +298,10 @@ def build_sections(results: Results) -> tuple[Section, ...]:
             "in the second. Controls are maps that use nothing the network learned. The thesis's score beside it: D = "
             "(1 \N{MINUS SIGN} |change of Γ|)² while pixels go, the most salient first, 1 where nothing changed; with "
             "every pixel gone no map has a part in it.",
-            blocks=_score_blocks(results),
+            blocks=[
+                *(table_scores(name, results.faithfulness.get(name), results.deletion.get(name)) for name in scored),
+                *([plates.plate_deletion(results.deletion)] if results.deletion else []),
+            ],
             step="faithfulness",
         ),
         Section(
@@ -342,14 +337,6 @@ def build_sections(results: Results) -> tuple[Section, ...]:
             blocks=[table_claims(f"{claims} {thesis.sample}", thesis.claims)] if thesis else [],
         ),
     )
-
-
-def _score_blocks(results: Results) -> list[Block]:
-    scored, deletion = results.faithfulness, results.deletion
-    names = _names({*scored, *deletion})
-    blocks: list[Block] = [table_scores(name, scored.get(name), deletion.get(name)) for name in names]
-    curves = {name: deletion[name] for name in names if name in deletion}
-    return [*blocks, *([plates.plate_deletion(curves)] if curves else [])]
 
 
 def missing_sections(results: Results, sections: Sequence[Section]) -> list[str]:

@@ -21,10 +21,9 @@ from sliplens.codec import load_record
 from sliplens.intervals import FEWEST_UNITS, Difference, paired_difference
 from sliplens.plots import style
 from sliplens.progress import number_of
-from sliplens.report.results import Results
 from sliplens.results.evaluation import RegressionScores, ScoredFrames
 from sliplens.results.faithfulness import Faithfulness
-from sliplens.results.study import CLOSE_TO_LABELS, TABLES, Truth
+from sliplens.results.study import CLOSE_TO_LABELS, TABLES, Results, Truth
 
 CITATION = (
     "Max Polak, Explainable Neural Networks for Incipient Slip Sensing in Robot Tactile Learning, Master's thesis, "
@@ -153,6 +152,16 @@ def judge_gap(gap: Difference | None) -> Outcome:
     return "holds" if gap.estimate > 0 else "does not hold"
 
 
+def scores_by_condition(results: Results) -> dict[str, dict[str, RegressionScores]]:
+    """Scores of the networks on test trials by condition and input, in the order they are read."""
+    scores = {name: results.evaluations[name].conditions for name in style.inputs_in_order(results.evaluations)}
+    conditions = style.conditions_in_order(condition for each in scores.values() for condition in each)
+    return {
+        condition: {name: each[condition] for name, each in scores.items() if condition in each}
+        for condition in conditions
+    }
+
+
 # can these maps be trusted?
 
 
@@ -240,7 +249,7 @@ def _judge_by_removal(faithful: Faithfulness, truth: Truth | None, *, verdict: b
         voting = [scores.get((*setting, method)) for setting in voting_settings(faithful, truth)]
         judged = [(score, score.lead_over_controls) for score in voting if score and score.lead_over_controls]
         gain = float(np.mean([score.srg.estimate for score, _ in judged])) if judged else -np.inf
-        ahead = sum(lead.shows_something for _, lead in judged)
+        ahead = sum(lead.gap.above_zero for _, lead in judged)
         status: Status = "ahead" if 2 * ahead > len(judged) else "tied" if ahead else "behind"
         row = MethodRow(
             input=faithful.input,

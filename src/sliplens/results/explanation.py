@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
-import pyarrow as pa
 from jaxtyping import Float, Float32, Float64, Shaped, UInt8
 
 from sliplens.codec import UNKNOWN, Columns, Result, load_record, load_result
@@ -111,22 +110,6 @@ class Explanation(OfOutput):
             f"by up to {change:+.3g} {self.unit_words} from that of {BASELINES[self.baseline]}"
         )
 
-    def to_arrow(self) -> pa.Table:
-        """Arrow table, a row a frame and method: predictions and completeness gap (NaN if not promised)."""
-        change = [frame.prediction - frame.reference_prediction for frame in self.frames]
-        gaps = [notes.completeness_gap or (np.nan,) * len(change) for notes in self.methods.values()]
-        count = len(self.methods)
-        return pa.table(
-            {
-                "method": np.repeat(list(self.methods), len(change)),
-                "id": [frame.id for frame in self.frames] * count,
-                "prediction": [frame.prediction for frame in self.frames] * count,
-                "reference_prediction": [frame.reference_prediction for frame in self.frames] * count,
-                "change": change * count,
-                "completeness_gap": np.concatenate([*gaps, []]),
-            }
-        )
-
     def baseline_words(self, row: int) -> str:
         """Return the baseline of a frame in words."""
         lacks_stick = self.baseline == "stick" and self.frames[row].baseline_frame is None
@@ -176,23 +159,20 @@ class Explanation(OfOutput):
             references=self.references[chosen],
             pictures=self.pictures[chosen],
             methods={
-                name: notes
-                if notes.completeness_gap is None
-                else replace(notes, completeness_gap=tuple(notes.completeness_gap[row] for row in chosen))
+                name: replace(
+                    notes, completeness_gap=(gap := notes.completeness_gap) and tuple(gap[row] for row in chosen)
+                )
                 for name, notes in self.methods.items()
             },
             relevance={name: maps[chosen] for name, maps in self.relevance.items()},
         )
 
 
-FULL_COLOUR_PERCENTILE = 99.5
-"""Percentile of a map that gets the brightest colour: a few outlying pixels would leave the rest of the map black."""
-
-
-def full_colour(relevance: Float[np.ndarray, "*any"], *, percentile: float = FULL_COLOUR_PERCENTILE) -> float:
+def full_colour(relevance: Float[np.ndarray, "*any"]) -> float:
     """Size of signed values that gets the full colour; 1 where all are zero."""
     sizes = np.abs(relevance)
-    return float(np.percentile(sizes, percentile)) or float(sizes.max()) or 1.0
+    # a few outlying pixels would leave the rest of the map black
+    return float(np.percentile(sizes, 99.5)) or float(sizes.max()) or 1.0
 
 
 def require_saliency(
@@ -284,8 +264,7 @@ class MovedMarkers:
     markers: Annotated[int, AMOUNT]
     """Markers that lie wholly in the image."""
     from_px: tuple[tuple[float, float], ...]
-    to_px: tuple[tuple[float, float], ...]
-    """Places of the moved markers, x and y in camera pixels."""
+    """Places of the moved markers in the frame, x and y in camera pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)

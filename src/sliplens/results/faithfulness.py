@@ -34,11 +34,7 @@ class Lead:
     control: str
     """The strongest in these frames."""
     gap: Difference
-
-    @property
-    def shows_something(self) -> bool:
-        """True if the method certainly beats every control; otherwise it shows nothing about this network."""
-        return self.gap.above_zero
+    """Where it is not above zero for sure, the method shows nothing about this network."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,13 +48,19 @@ class MethodScore:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DeletionTable(Columns):
-    """Deletion score D and prediction (in margin units) of each frame, method and step."""
+class FrameRows(Columns):
+    """Rows that each are of one frame."""
 
-    method: Shaped[np.ndarray, " rows"]
     frame_id: Shaped[np.ndarray, " rows"]
     day: Int64[np.ndarray, " rows"]
     trial: Shaped[np.ndarray, " rows"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeletionTable(FrameRows):
+    """Deletion score D and prediction (in margin units) of each frame, method and step."""
+
+    method: Shaped[np.ndarray, " rows"]
     step: Annotated[Int64[np.ndarray, " rows"], AMOUNT]
     pixels_removed: Annotated[Int64[np.ndarray, " rows"], AMOUNT]
     prediction: Annotated[Float64[np.ndarray, " rows"], ANSWER]
@@ -181,15 +183,12 @@ class RemovalCurve:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RemovalTable(Columns):
+class RemovalTable(FrameRows):
     """Change of the prediction (in margin units) of each frame, fill, unit, method and share of the image removed."""
 
     fill: Shaped[np.ndarray, " rows"]
     unit: Shaped[np.ndarray, " rows"]
     method: Shaped[np.ndarray, " rows"]
-    frame_id: Shaped[np.ndarray, " rows"]
-    day: Int64[np.ndarray, " rows"]
-    trial: Shaped[np.ndarray, " rows"]
     safety_margin: Annotated[Float64[np.ndarray, " rows"], MARGIN, UNKNOWN]
     area: Annotated[Float64[np.ndarray, " rows"], SHARE]
     most_first: Annotated[Float64[np.ndarray, " rows"], ANSWER]
@@ -255,7 +254,7 @@ class Faithfulness(OfOutput):
 
 
 def _by_frame(
-    rows: DeletionTable | RemovalTable, step: np.ndarray, values: Sequence[np.ndarray]
+    rows: FrameRows, step: np.ndarray, values: Sequence[np.ndarray]
 ) -> tuple[tuple[str, ...], Shaped[np.ndarray, "2 frames"], list[np.ndarray]]:
     """Frames in the order of their ids, their days and trials, and values by frame and step."""
     order = np.lexsort((step, rows.frame_id))

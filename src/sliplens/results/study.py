@@ -1,20 +1,22 @@
-"""Stages of a study: what was chosen, what the camera saw, and how the explanations were tested."""
+"""Stages of a study: what was chosen, what the camera saw, how the explanations were tested; results of a workspace."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import pyarrow as pa
 from jaxtyping import Float32, Float64, Int64, Shaped
 
-from sliplens.codec import UNKNOWN, Columns, Result, table_rows
+from sliplens.codec import UNKNOWN, Columns, Result, load_record, load_result, table_rows
+from sliplens.errors import InputError
+from sliplens.files import RUN_FILE, Provenance, require_folder
 from sliplens.intervals import Difference
 from sliplens.progress import number_of
-from sliplens.results.evaluation import AMOUNT, ANSWER, CORRELATION, MARGIN, PIXEL, Evaluation, OfNetwork
+from sliplens.results.evaluation import AMOUNT, ANSWER, CORRELATION, MARGIN, PIXEL, Evaluation, OfNetwork, Training
 from sliplens.results.explanation import BASELINES, Explanation, Strip
-from sliplens.results.faithfulness import DeletionScores, Faithfulness, Lead, MethodGap
+from sliplens.results.faithfulness import DeletionScores, Faithfulness, FrameRows, Lead, MethodGap
 
 CLOSE_TO_LABELS = 0.05
 """Largest error of a trial that is taken where too few qualify, in margin units; five such are needed for a verdict."""
@@ -62,8 +64,6 @@ class Choice(Result):
     """Trials that have a frame near every level."""
     qualified: int
     """Trials that qualify with every network."""
-    qualified_alone: dict[str, int]
-    """Trials that would qualify with one network alone, by input."""
     mean_error: dict[str, float]
     """Mean error of the answers on the scored frames, in margin units, by input."""
     source: str
@@ -109,14 +109,6 @@ class MarkerTable(Columns):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MarkerPlaces:
-    """Places of a frame's markers in camera pixels, x and y; NaN for one that was not followed."""
-
-    rest_px: Float64[np.ndarray, "markers 2"]
-    now_px: Float64[np.ndarray, "markers 2"]
-
-
-@dataclass(frozen=True, kw_only=True)
 class States(Result):
     """Markers of all chosen frames."""
 
@@ -126,15 +118,10 @@ class States(Result):
     """Markers of every chosen frame in which they are known."""
 
     @cached_property
-    def markers(self) -> dict[str, MarkerPlaces]:
+    def markers(self) -> dict[str, MarkerTable]:
         """Markers by frame, in the order of their numbers; frames in which none could be followed are absent."""
         rows = self.table.where(np.argsort(self.table.marker, kind="stable"))
-        return {
-            frame: MarkerPlaces(
-                rest_px=np.c_[frames.rest_x_px, frames.rest_y_px], now_px=np.c_[frames.x_px, frames.y_px]
-            )
-            for (frame,), frames in rows.groups("frame_id").items()
-        }
+        return {frame: markers for (frame,), markers in rows.groups("frame_id").items()}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,8 +167,6 @@ class Localisation:
     """Mean rank correlation, signed, of the map's means over the markers with the columns of `MarkerEffects`."""
     lead_over_controls: Lead | None
     """Of `neutral`; None for what is no method, or where it is undefined."""
-    lead_over_methods: dict[str, Difference]
-    """`neutral` less that of each other method."""
     edges: Difference | None
     """Mass on the edges of markers less the share of the image that they cover."""
 
@@ -205,12 +190,9 @@ class MetaTest:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MarkerEffects(Columns):
+class MarkerEffects(FrameRows):
     """Effect of each marker on the network's prediction, a row a marker and frame."""
 
-    frame_id: Shaped[np.ndarray, " rows"]
-    day: Int64[np.ndarray, " rows"]
-    trial: Shaped[np.ndarray, " rows"]
     safety_margin: Annotated[Float64[np.ndarray, " rows"], MARGIN, UNKNOWN]
     marker: Annotated[Int64[np.ndarray, " rows"], AMOUNT]
     x_px: Annotated[Float64[np.ndarray, " rows"], PIXEL]
@@ -227,12 +209,9 @@ class MarkerEffects(Columns):
 
 
 @dataclass(frozen=True, kw_only=True)
-class NeutralScores(Columns):
+class NeutralScores(FrameRows):
     """Correlation of each map with the effects of moved groups of markers, a row a frame and method."""
 
-    frame_id: Shaped[np.ndarray, " rows"]
-    day: Int64[np.ndarray, " rows"]
-    trial: Shaped[np.ndarray, " rows"]
     method: Shaped[np.ndarray, " rows"]
     correlation: Annotated[Float64[np.ndarray, " rows"], CORRELATION, UNKNOWN]
     """NaN where the effects do not vary."""
@@ -317,6 +296,8 @@ SETTINGS = (
     Setting(fill="reference", unit="tile"),
     Setting(fill="reference", unit="marker"),
 )
+REDRAWN = Setting(fill="true", unit="marker")
+"""Markers are put back in the scene, which is drawn anew."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -425,3 +406,92 @@ class Study(Result):
     def _tests(self) -> list[OfNetwork]:
         tables = self.faithfulness, self.map_quality, self.truth
         return [record for table in tables for record in table.values()]
+
+
+_KINDS = RECORDS | {"train": Training, "evaluate": Evaluation}
+"""Record of each stage."""
+_COMMANDS = ("train", "evaluate", "explain", "score")
+"""Stages that a command of their name makes; a study makes the others."""
+_BY_SOURCE = ("explain", "score", "faithfulness")
+"""Stages of which a workspace may hold two results of an input: of simulated and of real touch."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Results(Study):
+    """Everything that a workspace holds; a stage that was not run is None or an empty table."""
+
+    runs: dict[str, Provenance] = field(default_factory=dict)
+    """By the name of the folder, last finished last."""
+    trainings: dict[str, Training] = field(default_factory=dict)
+    real: dict[str, Explanation] = field(default_factory=dict)
+    """Explanations of frames of a real sensor, where the others are of simulated frames."""
+    strip: Strip | None = None
+    """One trial from stick to slip."""
+    notes: tuple[str, ...] = ()
+    """Sentences on how the results were chosen."""
+
+
+def load_results(workspace: Path) -> Results:
+    """Load every result in the direct subfolders of a workspace.
+
+    A folder counts when it holds `run.json`; its stage, input and source say what it is. Of two results of one kind the
+    one that finished last is loaded, and `Results.notes` says so.
+
+    Raises
+    ------
+    InputError
+        If the folder is missing or holds no result, or a file in it is malformed.
+    """
+    require_folder(workspace, what="the workspace")
+    files = [path / RUN_FILE for path in sorted(workspace.iterdir()) if path.is_dir() and path.name[0] != "."]
+    # a link that leads nowhere is refused, not passed over
+    runs = [
+        (path.parent, load_record(path, Provenance, command="sliplens"))
+        for path in files
+        if path.exists() or path.is_symlink()
+    ]
+    runs.sort(key=lambda item: item[1].finished)
+    if not any(run.stage in {*_KINDS, "simulate"} for _, run in runs):
+        raise InputError(
+            f"{workspace} holds no result to report; run `sliplens simulate` and the stages after it into this folder"
+        )
+    records: dict[tuple[str, str, str], Any] = {}
+    folders: dict[tuple[str, str, str], str] = {}
+    notes = []
+    for folder, run in runs:
+        if run.stage not in _KINDS or run.stage == "control":  # large maps, which no page shows
+            continue
+        command = run.stage if run.stage in _COMMANDS else "study"
+        record = load_result(folder, _KINDS[run.stage], command=f"sliplens {command}")
+        source = record.source if run.stage in _BY_SOURCE else ""
+        key = (run.stage, getattr(record, "input", ""), source)
+        if key in records:
+            notes.append(
+                f"Two folders hold a result of “{' '.join(filter(None, key))}”: {folder.name} finished last and is "
+                f"shown, {folders[key]} is not."
+            )
+        records[key], folders[key] = record, folder.name
+
+    def of(stage: str, source: str = "") -> Any:
+        return {
+            name: record for (each, name, origin), record in records.items() if each == stage and origin in ("", source)
+        }
+
+    choice, config = of("choice").get(""), workspace / CONFIG_FILE
+    tested = (record.source for (stage, *_), record in records.items() if stage in TESTS)
+    source = choice.source if choice else next(tested, "simulated")
+    tables = {table: of(stage, source) for stage, table in TABLES.items()}
+    # `sliplens score` writes the deletion score with the removal, a study writes it as a step
+    deletion = {name: scores for name, record in tables["faithfulness"].items() if (scores := record.deletion_scores)}
+    return Results(
+        folder=workspace,
+        config=load_record(config, StudyConfig, command="sliplens study") if config.exists() else None,
+        choice=choice,
+        states=of("states").get(""),
+        **tables | {"deletion": deletion | tables["deletion"]},
+        runs={folder.name: run for folder, run in runs},
+        trainings=of("train"),
+        real=of("explain", "real") if source != "real" else {},
+        strip=next(iter(of("strip").values()), None),
+        notes=tuple(notes),
+    )

@@ -6,7 +6,7 @@ from itertools import groupby
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
 from sliplens.errors import ImageError, InputError, RecordingError
@@ -23,19 +23,9 @@ from sliplens.markers import track_markers
 from sliplens.models import Network
 from sliplens.progress import number_of, report_each
 from sliplens.recordings import Dataset, TrialInfo
+from sliplens.results import study as records
 from sliplens.results.explanation import CLOSE, Explanation
-from sliplens.results.study import (
-    CLOSE_TO_LABELS,
-    STUDY_BUDGET,
-    STUDY_METHODS,
-    Choice,
-    ChosenFrame,
-    ChosenTrial,
-    MarkerPlaces,
-    MarkerTable,
-    States,
-    StudyConfig,
-)
+from sliplens.results.study import Choice, ChosenFrame, MarkerTable, StudyConfig
 
 SCORED_LEVELS = (0.4, 0.2, 0.0)
 """Margins at which the thesis scores: near slip, where there is much to explain."""
@@ -77,42 +67,29 @@ def choose_frames(networks: Mapping[str, Network], data: Dataset, config: StudyC
             "split or condition, or trials with more frames from full stick to full slip"
         )
     # sorting is stable: those that qualify keep the data set's order, so that none is picked for its looks
-    ranked = sorted(candidates, key=lambda each: 0.0 if each.trial.qualified else each.trial.worst)
-    close = sum(each.trial.worst <= max(tolerance, CLOSE_TO_LABELS) for each in ranked)
+    ranked = sorted(candidates, key=lambda each: 0.0 if each[0].qualified else each[0].worst)
+    close = sum(trial.worst <= max(tolerance, records.CLOSE_TO_LABELS) for trial, _, _ in ranked)
     taken = ranked[: min(trials, max(close, FEWEST_UNITS))]
-    best = min((candidate.trial for candidate in taken), key=lambda trial: trial.worst).trial
+    best = min((trial for trial, _, _ in taken), key=lambda trial: trial.worst).trial
     scored = [level in SCORED_LEVELS for level in LEVELS]
     return Choice(
         trials_wanted=trials,
         tolerance=tolerance,
         considered=len(candidates),
-        qualified=sum(candidate.trial.qualified for candidate in candidates),
-        qualified_alone={
-            name: sum(candidate.trial.worst_error[name] <= tolerance for candidate in candidates) for name in networks
-        },
-        mean_error={name: float(np.mean([candidate.errors[name][scored] for candidate in taken])) for name in networks},
+        qualified=sum(trial.qualified for trial, _, _ in candidates),
+        mean_error={name: float(np.mean([errors[name][scored] for _, _, errors in taken])) for name in networks},
         source=data.source,
         split=infos[0].split,
         condition=condition,
-        trials=tuple(candidate.trial for candidate in taken),
-        frames=tuple(replace(frame, pictured=frame.trial == best) for candidate in taken for frame in candidate.frames),
+        trials=tuple(trial for trial, _, _ in taken),
+        frames=tuple(replace(frame, pictured=frame.trial == best) for _, frames, _ in taken for frame in frames),
     )
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Candidate:
-    """A trial with a frame near every level."""
-
-    trial: ChosenTrial
-    frames: tuple[ChosenFrame, ...]
-    errors: dict[str, Float[np.ndarray, " levels"]]
-    """Errors of each network's answers, in margin units."""
 
 
 def _measure_trial(
     info: TrialInfo, networks: Mapping[str, Network], data: Dataset, *, tolerance: float
-) -> _Candidate | None:
-    """Measure the errors at the frames nearest to the levels; None where no frame is near one of them."""
+) -> tuple[records.ChosenTrial, tuple[ChosenFrame, ...], dict[str, Float[np.ndarray, " levels"]]] | None:
+    """Measure the errors of each network at the frames nearest to the levels; None where no frame is near one."""
     recording = data.load(info, truth=False)
     margin = np.where(recording.labelled, recording.safety_margin, np.nan)
     if not np.isfinite(margin).any():
@@ -139,11 +116,11 @@ def _measure_trial(
         )
         for level, row, label in zip(LEVELS, rows, margin[rows].tolist(), strict=True)
     )
-    trial = ChosenTrial(trial=info.trial, qualified=max(worst.values()) <= tolerance, worst_error=worst)
-    return _Candidate(trial=trial, frames=frames, errors=errors)
+    trial = records.ChosenTrial(trial=info.trial, qualified=max(worst.values()) <= tolerance, worst_error=worst)
+    return trial, frames, errors
 
 
-def show_states(choice: Choice, data: Dataset) -> States:
+def show_states(choice: Choice, data: Dataset) -> records.States:
     """Return the markers of every chosen frame.
 
     The simulator knows the markers' places; in recorded trials they are followed from the untouched sensor on. A trial
@@ -170,25 +147,30 @@ def show_states(choice: Choice, data: Dataset) -> States:
     marker = np.concatenate([np.arange(len(rest)) for rest in rests])
     names = np.array(ids, dtype=str)
     table = MarkerTable(frame_id=names, marker=marker, rest_x_px=rest_x, rest_y_px=rest_y, x_px=x, y_px=y)
-    return States(untracked=tuple(untracked), table=table)
+    return records.States(untracked=tuple(untracked), table=table)
 
 
 def network_places(
-    marked: MarkerPlaces, *, frame_size: tuple[int, int], image_size: int
+    markers: MarkerTable, *, frame_size: Sequence[int], image_size: int
 ) -> tuple[Float[np.ndarray, "seen 2"], float]:
     """Where a network sees the markers (x, y), and how far each one's surroundings reach, in its own pixels.
 
     A difference image shows a marker where it was and where it is; so its place is half-way, and half of the pitch, the
     median distance between neighbours, reaches both. Markers that were not followed are left out.
     """
-    middle = (marked.rest_px + marked.now_px) / 2
+    middle = np.stack([markers.rest_x_px + markers.x_px, markers.rest_y_px + markers.y_px], axis=1) / 2
     middle = middle[np.isfinite(middle).all(axis=1)]
-    scale = image_size / np.array([frame_size[1], frame_size[0]])
-    # pixel centres lie at whole numbers, edges half a pixel before
-    centres = (middle + 0.5) * scale - 0.5
+    centres = to_network_px(middle, frame_size, image_size=image_size).numpy()
     between = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
     np.fill_diagonal(between, np.inf)
     return centres, float(np.median(between.min(axis=1))) / 2
+
+
+def marker_sums(
+    relevance: Float[np.ndarray, "size size"], regions: Int[np.ndarray, "size size"], *, markers: int
+) -> Float64[np.ndarray, " markers"]:
+    """Sum a map over the region of each marker (`marker_regions`)."""
+    return np.bincount(regions.ravel(), relevance.astype(np.float64).ravel(), minlength=markers + 1)[:markers]
 
 
 THESIS_POLY_CAM = "poly-cam-thesis"
@@ -196,7 +178,9 @@ _AS_PUBLISHED: Likeness = (0.999, 0.97)
 """Of the thesis's map, compared with what was published; its weights are nearly all 1, so that this costs little."""
 
 
-def study_explainers(methods: Sequence[str] = STUDY_METHODS, *, budget: float = STUDY_BUDGET) -> dict[str, Explainer]:
+def study_explainers(
+    methods: Sequence[str] = records.STUDY_METHODS, *, budget: float = records.STUDY_BUDGET
+) -> dict[str, Explainer]:
     """Explainers of a study: rows of `EXPLAINERS`, Poly-CAM with some of the channels measured at first."""
     for name in methods:
         EXPLAINERS.pick(name)
@@ -226,7 +210,7 @@ class Material:
     """Inputs of the network, in [0, 1]."""
     references: Float[Tensor, "frames colours size size"]
     """Inputs of the baseline of each frame."""
-    markers: Mapping[str, MarkerPlaces]
+    markers: Mapping[str, MarkerTable]
     """By frame, in camera pixels; frames in which none could be followed are absent."""
     explainers: Mapping[str, Explainer]
     """By name, with the options that made the maps."""
@@ -236,18 +220,18 @@ class Material:
         shape = (self.inputs.shape[-2], self.inputs.shape[-1])
         count = len(self.inputs)
         sides = {"pixel": 1, "tile": max(1, round(_TILE_PX * shape[0] / 224))}
-        records = {name: [tile_regions(shape, tile_px=side).numpy()] * count for name, side in sides.items()}
+        units = {name: [tile_regions(shape, tile_px=side).numpy()] * count for name, side in sides.items()}
         if all(frame.id in self.markers for frame in self.explained.frames):
-            records["marker"] = [
+            units["marker"] = [
                 marker_regions(shape, torch.from_numpy(centres), radius_px=reach).numpy()
                 for centres, reach in (self.places(frame.id) for frame in self.explained.frames)
             ]
-        return records
+        return units
 
     def places(self, frame: str) -> tuple[Float[np.ndarray, "seen 2"], float]:
         """Where the network sees the markers of a frame, and how far each one reaches (`network_places`)."""
         size = self.trained.manifest.frame_size
-        return network_places(self.markers[frame], frame_size=(size[0], size[1]), image_size=self.inputs.shape[-1])
+        return network_places(self.markers[frame], frame_size=size, image_size=self.inputs.shape[-1])
 
 
 def worth_scoring(chosen: Iterable[ChosenFrame], explained: Explanation) -> tuple[ChosenFrame, ...]:
@@ -271,7 +255,7 @@ def gather(
     explained: Explanation,
     chosen: tuple[ChosenFrame, ...],
     *,
-    markers: Mapping[str, MarkerPlaces],
+    markers: Mapping[str, MarkerTable],
     explainers: Mapping[str, Explainer],
 ) -> Material:
     """Gather what the scores need of the chosen frames, each of which is explained."""
@@ -289,10 +273,10 @@ def gather(
 
 
 def marker_places(
-    trained: Network, chosen: Sequence[ChosenFrame], markers: Mapping[str, MarkerPlaces]
+    trained: Network, chosen: Sequence[ChosenFrame], markers: Mapping[str, MarkerTable]
 ) -> list[Float[Tensor, "_markers 2"]]:
     """Where the markers of each frame are, in the network's pixels; those that were not followed are left out."""
-    now = [markers[frame.id].now_px for frame in chosen]
+    now = [np.stack([markers[frame.id].x_px, markers[frame.id].y_px], axis=1) for frame in chosen]
     valid = [places[np.isfinite(places).all(axis=1)] for places in now]
     manifest = trained.manifest
     return [to_network_px(places, manifest.frame_size, image_size=manifest.image_size) for places in valid]

@@ -1,4 +1,4 @@
-"""Public call that explains frames, its folder, and the strip of one trial."""
+"""Public call that explains frames, its folder, the strip of one trial, and the proof of a map."""
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -7,32 +7,15 @@ from pathlib import Path
 from typing import Literal, TypedDict, Unpack, cast
 
 import numpy as np
+from jaxtyping import Float32, UInt8
 from torch import nn
 
 from sliplens.errors import InputError, SliplensError
+from sliplens.explainers import frames as choosing
 from sliplens.explainers.contract import Explainer
-from sliplens.explainers.explain import (
-    MethodMaps,
-    Methods,
-    choose_explainers,
-    explain_frames,
-    explain_rows,
-    join_maps,
-    with_markers,
-)
-from sliplens.explainers.frames import (
-    MARGIN_LEVELS,
-    Baseline,
-    ChosenFrames,
-    FrameSelection,
-    find_stick_frame,
-    frames_from_arrays,
-    frames_from_dataset,
-    frames_from_folder,
-    nearest_frame,
-    require_labels,
-)
-from sliplens.explainers.occlusion import markers_in_recording
+from sliplens.explainers.explain import MethodMaps, Methods, choose_explainers, explain_rows, join_maps, with_markers
+from sliplens.explainers.frames import MARGIN_LEVELS, Baseline, ChosenFrames, FrameSelection
+from sliplens.explainers.occlusion import marker_regions, markers_in_recording, to_network_px
 from sliplens.explainers.table import EXPLAINERS, RECOMMENDED_METHOD
 from sliplens.images import Images, as_frames, read_image
 from sliplens.models import Network
@@ -42,10 +25,10 @@ from sliplens.progress import OnProgress, add_note, ignore, number_of, open_stag
 from sliplens.recordings import Dataset, Recording, load_dataset
 from sliplens.recordings.dataset import DATASET_FILE
 from sliplens.recordings.sensor import SensorProfile, load_profile
-from sliplens.results.explanation import BASELINES, Explanation, Strip, StripReadings, load_explanation
+from sliplens.results.explanation import BASELINES, Explanation, MovedMarkers, Strip, StripReadings, load_explanation
 from sliplens.runner import Part, part
-from sliplens.study.choice import study_explainers, without_markers
-from sliplens.study.neutral import prove_map
+from sliplens.simulation.trials import put_markers_back, rebuild_trial, visible_markers
+from sliplens.study.choice import marker_sums, study_explainers, without_markers
 from sliplens.study.stages import MakeRecord, Stage, keep_record
 
 
@@ -156,12 +139,13 @@ def explain(
     explainers, warnings = choose_explainers(network, chosen, method, budget=budget)
     frames = number_of(len(chosen.ids), "frame")
     title = f"Explaining {frames} ({network.manifest.input}, {chosen.source})"
+    bare = replace(chosen, find_markers=None)
+    work = Explaining(trained=network, chosen=bare, explainers=explainers, warnings=warnings)
     with reporting(running.get("on_progress")):
         if out is None:
             with open_stage(title):
-                return explain_frames(network, chosen, explainers, warnings=warnings)
-        images = hashlib.sha256(chosen.images.numpy().tobytes())
-        images.update(chosen.references.numpy().tobytes())
+                return work.make()
+        images = hashlib.sha256(chosen.images.numpy().tobytes() + chosen.references.numpy().tobytes())
         recipe = {"weights_sha256": network.manifest.weights_sha256, "input": network.manifest.input}
         recipe |= {"source": chosen.source, "ids": chosen.ids, "images_sha256": images.hexdigest()}
         recipe |= {"method": tuple(explainers), "budget": budget, "baseline": chosen.baseline}
@@ -169,12 +153,6 @@ def explain(
         what = f"{maps} of {frames if len(chosen.ids) == 1 else f'each of {frames}'}, panel.png"
 
         def make(parts: Path) -> Explanation:
-            work = Explaining(
-                trained=network,
-                chosen=replace(chosen, find_markers=None),
-                explainers=explainers,
-                warnings=warnings,
-            )
             with open_stage(title):
                 explanation = work.make(parts, on=running.get("on", "serial"))
                 notes = explanation.methods
@@ -206,7 +184,9 @@ def _choose(
         if sensor is not None:
             raise InputError("a data set's frames went through their profile on import; leave out --sensor")
         selection = select or FrameSelection()
-        return frames_from_dataset(network, source, selection, baseline="stick" if baseline is None else baseline)
+        return choosing.frames_from_dataset(
+            network, source, selection, baseline="stick" if baseline is None else baseline
+        )
     if not isinstance(source, str | Path):
         image = read_image(Path(reference)) if isinstance(reference, str | Path) else reference
         if image is not None:
@@ -214,16 +194,11 @@ def _choose(
             if len(images) != 1:
                 raise InputError(f"the reference has {len(images)} images; give one of the untouched sensor")
             image = images[0]
-        return frames_from_arrays(
+        return choosing.frames_from_arrays(
             network, as_frames(source), image, baseline="untouched" if baseline is None else baseline
         )
-    return frames_from_folder(
-        network,
-        Path(source),
-        reference=reference,
-        labels_in_names=labels_in_names,
-        sensor=sensor,
-        baseline=baseline,
+    return choosing.frames_from_folder(
+        network, Path(source), reference=reference, labels_in_names=labels_in_names, sensor=sensor, baseline=baseline
     )
 
 
@@ -288,9 +263,6 @@ class Explaining(Stage[Explanation]):
         return join_maps(self.trained, self.chosen, maps, warnings=self.warnings)
 
 
-_CONFIDENCE = 0.9
-
-
 def make_strip(
     network: Network,
     recording: Recording,
@@ -309,18 +281,17 @@ def make_strip(
     the last of the frames is then drawn again with markers moved back to the stick frame (`prove_map`, whose random
     markers `seed` draws).
     """
-    margin = require_labels(recording.trial, np.where(recording.labelled, recording.safety_margin, np.nan))
-    rows = tuple(sorted({nearest_frame(margin, level) for level in levels}))
+    margin = choosing.require_labels(recording.trial, np.where(recording.labelled, recording.safety_margin, np.nan))
+    rows = tuple(sorted({choosing.nearest_frame(margin, level) for level in levels}))
     estimate = network.estimate(network.encode(recording.frames, recording.reference))
-    missing = np.full(len(margin), np.nan)
-    low, high = estimate.interval(_CONFIDENCE) or (missing, missing)
+    low, high = estimate.interval(0.9) or (np.full(len(margin), np.nan),) * 2
     withheld = estimate.withheld(np.isfinite(margin))
     trusted = np.array([reason is None for reason in withheld])
     pictures, size = recording.frames[list(rows)], network.manifest.image_size
-    stick = find_stick_frame(recording.trial, recording.frames, recording.reference, margin)[0]
+    stick = choosing.find_stick_frame(recording.trial, recording.frames, recording.reference, margin)[0]
     stick = None if baseline == "untouched" else stick
     compared = "untouched" if stick is None else recording.frames[stick]
-    chosen = frames_from_arrays(network, pictures, recording.reference, baseline=compared)
+    chosen = choosing.frames_from_arrays(network, pictures, recording.reference, baseline=compared)
     explainers = study_explainers([method])
     inputs = network.encoding.normalise(chosen.images)
     try:
@@ -329,9 +300,8 @@ def make_strip(
         )
     except SliplensError:  # another sensor, or no OpenCV
         explainers = without_markers(explainers)
-    [(name, maps)] = explain_frames(network, chosen, explainers).relevance.items()
-    predicted = (np.where(trusted, values, np.nan).astype(np.float64) for values in (estimate.margin, low, high))
-    prediction, low, high = predicted
+    [(name, maps)] = Explaining(trained=network, chosen=chosen, explainers=explainers).make().relevance.items()
+    prediction, low, high = np.where(trusted, np.stack([estimate.margin, low, high]), np.nan).astype(np.float64)
     strip = Strip(
         trial=recording.trial,
         condition=recording.condition,
@@ -358,3 +328,61 @@ def make_strip(
         network, folder, recording, frame=rows[-1], stick=stick, relevance=maps[-1], rng=np.random.default_rng(seed)
     )
     return strip if proof is None else replace(strip, moved=proof[0], redrawn=proof[1])
+
+
+RANDOM_SETS = 20
+"""Sets of random markers that are moved beside those of a map."""
+
+
+def prove_map(
+    network: Network,
+    folder: Path,
+    recording: Recording,
+    *,
+    frame: int,
+    stick: int,
+    relevance: Float32[np.ndarray, "size size"],
+    rng: np.random.Generator,
+) -> tuple[MovedMarkers, UInt8[np.ndarray, "1 height width 3"]] | None:
+    """Move the fewest markers that hold half of a map's supporting relevance to the stick frame, and predict again.
+
+    `folder` is that of the data set. As many random markers are moved for comparison. The new drawing is returned with
+    the record; None where the trial cannot be drawn again, or the map nowhere supports the change of the prediction.
+    """
+    try:
+        film = rebuild_trial(folder, recording)
+    except InputError:
+        return None
+    visible = visible_markers(film.sensor)
+    size = network.manifest.image_size
+    centres = to_network_px(film.marker_px[frame][visible], recording.frames.shape[1:3], image_size=size)
+
+    def predict(moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        back = np.zeros((len(moved), len(film.marker_rest_px)), dtype=bool)
+        back[:, visible] = moved
+        drawn = put_markers_back(film, frame, back, to=stick).draw_all()
+        return drawn, network.predict(network.encode(drawn, recording.reference)).cpu().numpy().astype(np.float64)
+
+    count = len(visible)
+    _, (now, after_all) = predict(np.stack([np.zeros(count, dtype=bool), np.ones(count, dtype=bool)]))
+    sums = marker_sums(relevance, marker_regions((size, size), centres).numpy(), markers=count)
+    supporting = np.clip(sums * np.sign(now - after_all), 0, None)
+    if supporting.sum() <= 0:
+        return None
+    order = np.argsort(-supporting, kind="stable")
+    few = 1 + int(np.argmax(np.cumsum(supporting[order]) >= 0.5 * supporting.sum()))
+    sets = np.stack([order[:few], *(rng.choice(count, few, replace=False) for _ in range(RANDOM_SETS))])
+    moved = np.zeros((len(sets), count), dtype=bool)
+    np.put_along_axis(moved, sets, values=True, axis=1)
+    drawn, after = predict(moved)
+    record = MovedMarkers(
+        frame=frame,
+        prediction=float(now),
+        change=float(now - after[0]),
+        change_all=float(now - after_all),
+        change_random=float(np.mean(now - after[1:])),
+        random_sets=RANDOM_SETS,
+        markers=count,
+        from_px=tuple((float(x), float(y)) for x, y in film.marker_px[frame][visible[order[:few]]]),
+    )
+    return record, drawn[:1]

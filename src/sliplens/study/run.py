@@ -31,19 +31,7 @@ from sliplens.results.faithfulness import NEW_WEIGHTS, RemovalCurve
 from sliplens.results.study import CONFIG_FILE, QUICK_METHODS, RECORDS, SETTINGS, TABLES, TESTS, Study, StudyConfig
 from sliplens.runner import MakePart, Work, require_executor
 from sliplens.simulation.trials import rebuild_trial
-from sliplens.study.choice import (
-    LEVELS,
-    SCORED_LEVELS,
-    Material,
-    choose_frames,
-    gather,
-    marker_places,
-    sample_trials,
-    show_states,
-    study_explainers,
-    without_markers,
-    worth_scoring,
-)
+from sliplens.study import choice
 from sliplens.study.explaining import Explaining, make_strip
 from sliplens.study.scoring import STUDY_AREAS, STUDY_ORDERS, Influence, PixelDeletion, Removal, Untrained, measure_maps
 from sliplens.study.stages import Stage, keep_record
@@ -116,7 +104,7 @@ def run_study(
     require_executor(on)
     data = data if isinstance(data, Dataset) else load_dataset(data)
     config = _quick(config, data) if config.quick else config
-    study_explainers(config.methods, budget=config.budget)
+    choice.study_explainers(config.methods, budget=config.budget)
     with reporting(on_progress), ExitStack() as stack:
         _require_trials(data, config)
         records = Records(
@@ -205,9 +193,9 @@ class Records:
     @cached_property
     def explainers(self) -> dict[str, Explainer]:
         """Explainers by name; tiles stand for markers where the markers of some frame are unknown."""
-        explainers, markers = study_explainers(self.config.methods, budget=self.config.budget), self["states"].markers
-        everywhere = all(frame.id in markers for frame in self["choice"].frames)
-        return explainers if everywhere else without_markers(explainers)
+        explainers = choice.study_explainers(self.config.methods, budget=self.config.budget)
+        everywhere = all(frame.id in self["states"].markers for frame in self["choice"].frames)
+        return explainers if everywhere else choice.without_markers(explainers)
 
     @cached_property
     def not_redrawn(self) -> str:
@@ -221,11 +209,11 @@ class Records:
         return ""
 
     @cached_property
-    def material(self) -> Material:
+    def material(self) -> choice.Material:
         """Explanations of the frames that are scored."""
         explained = self["explain"]
-        scored = worth_scoring(self["choice"].frames, explained)
-        return gather(self.run, explained, scored, markers=self["states"].markers, explainers=self.explainers)
+        scored = choice.worth_scoring(self["choice"].frames, explained)
+        return choice.gather(self.run, explained, scored, markers=self["states"].markers, explainers=self.explainers)
 
     @cached_property
     def influence(self) -> Influence:
@@ -243,7 +231,7 @@ def _quick(config: StudyConfig, data: Dataset) -> StudyConfig:
 
 def _require_trials(data: Dataset, config: StudyConfig) -> None:
     """Refuse data of too few trials to decide anything; they can be asked for."""
-    infos = sample_trials(data, split=config.split, condition=config.condition)
+    infos = choice.sample_trials(data, split=config.split, condition=config.condition)
     trials = f"{number_of(len(infos), f'{infos[0].split} trial')} of condition {config.condition}"
     if len(infos) < min(FEWEST_UNITS, config.trials):
         raise InputError(
@@ -257,7 +245,8 @@ def _require_trials(data: Dataset, config: StudyConfig) -> None:
 def estimate_minutes(records: Records) -> float:
     """Estimate the minutes that the steps take on one core, from a few forward passes; half or twice of it is usual."""
     config, seconds, methods = records.config, 0.0, len(records.config.methods)
-    trials = min(config.trials, len(sample_trials(records.data, split=config.split, condition=config.condition)))
+    infos = choice.sample_trials(records.data, split=config.split, condition=config.condition)
+    trials = min(config.trials, len(infos))
     for run in records.networks.values():
         size = run.manifest.image_size
         images = torch.zeros(32, run.encoding.colours, size, size, device=run.device)
@@ -266,14 +255,14 @@ def estimate_minutes(records: Records) -> float:
         run.predict(images)
         # passes of a frame by step: a map takes some 200 of them
         passes = {
-            "explain": 200 * methods * len(LEVELS) / len(SCORED_LEVELS),
+            "explain": 200 * methods * len(choice.LEVELS) / len(choice.SCORED_LEVELS),
             "control": 100 * methods,
             "score": (methods + 1) * size,
             "faithfulness": len(SETTINGS) * (4 * methods + 20) * len(STUDY_AREAS),
             "truth": 3000 if records.data.simulated else 0,
         }
         scored = sum(passes.get(step, 0) for step in _required_steps(config.tests))
-        seconds += trials * len(SCORED_LEVELS) * scored * (time.perf_counter() - started) / len(images)
+        seconds += trials * len(choice.SCORED_LEVELS) * scored * (time.perf_counter() - started) / len(images)
     return seconds / 60
 
 
@@ -300,7 +289,7 @@ def _explain(records: Records) -> Explaining:
     places = [(frame.trial, frame.frame) for frame in chosen]
     frames = frames_at(run, records.data, places, baseline=records.config.baseline)
     images = run.encoding.normalise(frames.images)
-    explainers = with_markers(records.explainers, images, lambda: marker_places(run, chosen, markers))
+    explainers = with_markers(records.explainers, images, lambda: choice.marker_places(run, chosen, markers))
     return Explaining(trained=run, chosen=replace(frames, find_markers=None), explainers=explainers)
 
 
@@ -354,8 +343,8 @@ class Step:
 
 
 SHARED: dict[str, Step] = {
-    "choice": Step("Choosing trials", lambda records: choose_frames(records.networks, records.data, records.config)),
-    "states": Step("Following markers", lambda records: show_states(records["choice"], records.data)),
+    "choice": Step("Choosing trials", lambda each: choice.choose_frames(each.networks, each.data, each.config)),
+    "states": Step("Following markers", lambda records: choice.show_states(records["choice"], records.data)),
     "strip": Step("Explaining a trial from stick to slip", _show_trial),
 }
 """Steps whose record is of all networks."""

@@ -21,24 +21,17 @@ from sliplens.explainers.gradients import IntegratedGradients
 from sliplens.explainers.occlusion import tile_regions
 from sliplens.explainers.poly_cam import PolyCam
 from sliplens.explainers.shapley import Shapley
-from sliplens.faithfulness import scoring
-from sliplens.faithfulness.controls import (
-    cascade,
-    even_channels,
-    infidelity,
-    max_sensitivity,
-    resolution,
-    total_variation,
-)
+from sliplens.faithfulness import controls, scoring
 from sliplens.faithfulness.fills import get_fill
-from sliplens.faithfulness.removal import AREAS, RANDOM_ORDERS, Units, answer_whole, score_maps
+from sliplens.faithfulness.removal import AREAS, RANDOM_ORDERS, SHARES, Units, score_maps
 from sliplens.intervals import paired_difference
 from sliplens.models import Network
 from sliplens.models.wrapping import open_run
 from sliplens.progress import open_stage, report_each, reporting
+from sliplens.results import faithfulness as records
 from sliplens.results.explanation import Explanation, load_explanation
-from sliplens.results.faithfulness import NEW_WEIGHTS, Deletion, DeletionScores, Faithfulness, MethodGap, RemovalCurve
-from sliplens.results.study import SETTINGS, MapMeasures, MapQuality, Setting, UntrainedMaps
+from sliplens.results.faithfulness import CHANCE, NEW_WEIGHTS, DeletionScores, Faithfulness, MethodGap, RemovalCurve
+from sliplens.results.study import REDRAWN, SETTINGS, MapMeasures, MapQuality, Setting, UntrainedMaps
 from sliplens.runner import Part
 from sliplens.study.choice import Material, trial_seed
 from sliplens.study.explaining import Running
@@ -51,8 +44,7 @@ STUDY_AREAS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)
 STUDY_ORDERS = 10
 """Random orders that every method of a study has to beat."""
 _TILES_ACROSS = 14
-REDRAWN = Setting(fill="true", unit="marker")
-Influence: TypeAlias = Mapping[str, Float[np.ndarray, "images height width"]]
+Influence: TypeAlias = Mapping[str, controls.Maps]
 """Maps that rank parts, of each method and control."""
 
 
@@ -164,17 +156,17 @@ def score(
                 results.append(stage.make(parts, on=running.get("on", "serial")))
         faithfulness, *deletions = results
         for scores in deletions:
-            deletion = Deletion(**{field.name: getattr(scores, field.name) for field in fields(Deletion)})
+            deletion = records.Deletion(**{each.name: getattr(scores, each.name) for each in fields(records.Deletion)})
             faithfulness = replace(faithfulness, deletion=deletion, deletion_table=scores.table)
         return faithfulness
 
     with reporting(running.get("on_progress")):
         if out is None:
             return make(None)
-        hashes = hashlib.sha256()
-        for values in explanation.relevance.values():
-            hashes.update(values.tobytes())
-        config = {"weights_sha256": network.manifest.weights_sha256, "maps_sha256": hashes.hexdigest()}
+        maps_sha256 = hashlib.sha256(
+            b"".join(values.tobytes() for values in explanation.relevance.values())
+        ).hexdigest()
+        config = {"weights_sha256": network.manifest.weights_sha256, "maps_sha256": maps_sha256}
         config |= {"input": explanation.input, "source": explanation.source, "seed": seed, "steps": steps}
         config |= {"fill": fill, "unit": unit, "random_orders": random_orders}
         overwrite = running.get("overwrite", False)
@@ -197,12 +189,11 @@ def _to_score(
         return load_explanation(Path(frames))
     if maps is None:
         raise InputError("the frames have no maps to score; give an explanation of them, or an array of maps")
+    count = len(maps if isinstance(maps, np.ndarray) else maps.frames)
+    if count != len(frames):
+        raise SaliencyError(f"there are {count} maps of {len(frames)} frames; explain the frames that are scored")
     if isinstance(maps, np.ndarray):
         return scoring.explanation_of_maps(network, frames, maps, reference, signed=signed)
-    if len(maps.frames) != len(frames):
-        raise SaliencyError(
-            f"there are {len(maps.frames)} maps of {len(frames)} frames; explain the frames that are scored"
-        )
     return maps
 
 
@@ -210,7 +201,7 @@ def _to_score(
 class Removal(Stage[Faithfulness]):
     """Removal of parts in the order of every map, under each setting; a part is a setting and a trial."""
 
-    record = scoring.SettingCurves
+    record = TrialArrays
     title = "Removing parts"
 
     trained: Network
@@ -225,10 +216,6 @@ class Removal(Stage[Faithfulness]):
     redraw: Callable[[Explanation, Influence, int], Mapping[str, RemovalCurve]] | None = None
     """Curves under the true fill, by drawing the scene anew; None where it cannot be."""
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        for setting in self.settings:
-            get_fill(setting.fill)
 
     @property
     def _all_settings(self) -> list[Setting]:
@@ -247,18 +234,14 @@ class Removal(Stage[Faithfulness]):
         passes = len(self.settings) * len(inputs) * orders * (len(self.areas) - 2)
         predict, trials = scoring.prepare_passes(self.trained, inputs, passes), list(self.explained.trials)
 
-        def remove_parts(item: tuple[str, str, str]) -> scoring.SettingCurves:
+        def remove_parts(item: tuple[str, str, str]) -> TrialArrays:
             fill, unit, trial = item
             setting, rows = Setting(fill=fill, unit=unit), self.explained.trials[trial]
             part, maps = self.explained.take(rows), {name: values[rows] for name, values in self.maps.items()}
             images, empty, seed = inputs[rows], references[rows], trial_seed(self.seed, trials.index(trial))
             if setting == REDRAWN and self.redraw is not None:
-                curves, blank = self.redraw(part, maps, seed), np.full(len(rows), np.nan)
+                curves = self.redraw(part, maps, seed)
             else:
-                paint = get_fill(fill)(images, empty, seed)
-                gone = torch.ones((len(images), *images.shape[-2:]), dtype=torch.bool, device=images.device)
-                batches = torch.arange(len(images), device=images.device).split(16)
-                blank = answer_whole(predict, torch.cat([paint(batch, gone[batch]) for batch in batches]))
                 curves = score_maps(
                     predict,
                     images,
@@ -273,30 +256,25 @@ class Removal(Stage[Faithfulness]):
                     areas=self.areas,
                     seed=seed,
                 )
-            return scoring.SettingCurves(
-                areas=next(iter(curves.values())).areas,
-                curves={
-                    name: np.stack([curve.most_first, curve.least_first, curve.random])
+            return TrialArrays(
+                arrays={
+                    name: np.stack([curve.most_first, curve.least_first, curve.random], axis=1)
                     for name, curve in curves.items()
-                },
-                whole=answer_whole(predict, images),
-                blank=blank,
+                }
             )
 
         return remove_parts
 
-    def join(self, records: Sequence[scoring.SettingCurves]) -> Faithfulness:
+    def join(self, records: Sequence[TrialArrays]) -> Faithfulness:
         """Score all curves."""
-        count = len(self.explained.trials)
-        curves = {}
+        count, curves = len(self.explained.trials), {}
         for at, setting in enumerate(self._all_settings):
-            parts = records[at * count : (at + 1) * count]
-            answers = [{"whole": part.whole, "blank": part.blank} for part in parts]
-            curves[setting] = scoring.SettingCurves(
-                areas=parts[0].areas,
-                curves=join_trials(self.explained, [part.curves for part in parts], axis=1),
-                **join_trials(self.explained, answers),
-            )
+            areas = np.array(SHARES if setting == REDRAWN else self.areas)
+            arrays = join_trials(self.explained, records[at * count : (at + 1) * count])
+            curves[setting] = {
+                name: RemovalCurve(areas=areas, most_first=rows[:, 0], least_first=rows[:, 1], random=rows[:, 2])
+                for name, rows in arrays.items()
+            }
         return scoring.score_curves(self.explained, curves, random_orders=self.random_orders, seed=self.seed)
 
 
@@ -321,7 +299,9 @@ class PixelDeletion(Stage[DeletionScores]):
     def prepare(self) -> MakeRecord:
         """Return the function that deletes the pixels of the frames of a trial."""
         inputs, size = network_inputs(self.trained, self.explained), self.explained.image_size
-        orders = scoring.deletion_orders(self.explained, seed=self.seed)
+        rng, saliency = np.random.default_rng(self.seed), self.explained.saliency
+        orders = {name: np.stack(list(map(scoring.deletion_order, maps))) for name, maps in saliency.items()}
+        orders[CHANCE] = np.stack([rng.permutation(size**2) for _ in self.explained.frames])
         removed = scoring.deletion_steps((size, size), steps=self.steps)
         predict = scoring.prepare_passes(self.trained, inputs, len(orders) * len(inputs) * len(removed))
 
@@ -337,8 +317,7 @@ class PixelDeletion(Stage[DeletionScores]):
 
     def join(self, records: Sequence[TrialArrays]) -> DeletionScores:
         """Score all curves."""
-        answers = join_trials(self.explained, [record.arrays for record in records])
-        return scoring.score_deletion(self.explained, answers, fill=self.fill)
+        return scoring.score_deletion(self.explained, join_trials(self.explained, records), fill=self.fill)
 
 
 _FEW_CHANNELS, _FEW_PAIRS = 0.05, 100
@@ -353,11 +332,11 @@ def measure_maps(material: Material, *, seed: int = 0) -> MapQuality:
     for method in report_each(list(material.explainers)):
         maps = explained.saliency[method].astype(np.float64)
         resolutions = [
-            resolution(saliency, material.places(frame.id)[0])
+            controls.resolution(saliency, material.places(frame.id)[0])
             for saliency, frame in zip(maps, explained.frames, strict=True)
             if frame.id in material.markers
         ]
-        roughness[method] = np.array([total_variation(saliency) for saliency in maps])
+        roughness[method] = np.array([controls.total_variation(saliency) for saliency in maps])
         explainer = _shortened(material.explainers[method])
 
         def explain(images: Tensor, explainer: Explainer = explainer) -> Tensor:
@@ -365,12 +344,12 @@ def measure_maps(material: Material, *, seed: int = 0) -> MapQuality:
             return explainer(model, images, reference=references).relevance
 
         relevance = torch.from_numpy(explained.relevance[method][:_FEW_FRAMES])
-        errors = infidelity(lambda images: model(images).flatten(), few, compared, relevance)
+        errors = controls.infidelity(lambda images: model(images).flatten(), few, compared, relevance)
         measures[method] = MapMeasures(
             resolution=mean_of_known(np.array(resolutions, dtype=np.float64)),
             total_variation=mean_of_known(roughness[method]),
             infidelity=mean_of_known(errors),
-            max_sensitivity=mean_of_known(max_sensitivity(explain, few)),
+            max_sensitivity=mean_of_known(controls.max_sensitivity(explain, few)),
         )
     return MapQuality(
         input=explained.input,
@@ -423,17 +402,18 @@ class Untrained(Stage[UntrainedMaps]):
     def prepare(self) -> MakeRecord:
         """Return the function that explains the frames of a trial with its network."""
         material, inputs, references = self.material, self.material.inputs, self.material.references
-        controls = {name: _shortened(explainer) for name, explainer in material.explainers.items()}
+        shortened = {name: _shortened(explainer) for name, explainer in material.explainers.items()}
         trials = material.explained.trials
 
         def explain(item: tuple[str]) -> TrialArrays:
             frames, seed = trials[item[-1]], trial_seed(self.seed, list(trials).index(item[-1]))
-            ((_, model),) = cascade(material.trained.model, seed=seed, stages=1, images=inputs)
+            ((_, model),) = controls.cascade(material.trained.model, seed=seed, stages=1, images=inputs)
             maps: dict[str, list[np.ndarray]] = {}
             with suppress(ModelError):  # without layers that have a map
-                maps["weights-1"] = list(even_channels(model, inputs[frames], references[frames]).cpu().numpy())
+                even = controls.even_channels(model, inputs[frames], references[frames])
+                maps["weights-1"] = list(even.cpu().numpy())
             for name, frame in report_each(list(product(material.explainers, frames))):
-                attribution = controls[name](model, inputs[frame, None], reference=references[frame, None])
+                attribution = shortened[name](model, inputs[frame, None], reference=references[frame, None])
                 maps.setdefault(name, []).append(attribution.influence[0].float().cpu().numpy())
             return TrialArrays(arrays={name + NEW_WEIGHTS: np.stack(rows) for name, rows in maps.items()})
 
@@ -442,5 +422,4 @@ class Untrained(Stage[UntrainedMaps]):
     def join(self, records: Sequence[TrialArrays]) -> UntrainedMaps:
         """Join the maps of all frames."""
         explained = self.material.explained
-        maps = join_trials(explained, [record.arrays for record in records])
-        return UntrainedMaps(input=explained.input, source=explained.source, maps=maps)
+        return UntrainedMaps(input=explained.input, source=explained.source, maps=join_trials(explained, records))

@@ -1,7 +1,7 @@
 """Stages of a study: work on parts that are records, and the result that these make together."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeAlias, TypeVar
@@ -60,13 +60,7 @@ class Stage(Work, Generic[Result]):
 
         return make
 
-    def make(
-        self,
-        folder: Path | None = None,
-        *,
-        work: Work | None = None,
-        on: str = "serial",
-    ) -> Result:
+    def make(self, folder: Path | None = None, *, work: Work | None = None, on: str = "serial") -> Result:
         """Make the result, in memory or of the records in a folder, of which those that exist are not made again.
 
         `work` opens this stage in other processes; the stage itself does if None.
@@ -111,19 +105,11 @@ def trial_parts(explained: Explanation, *settings: str, maps: int = 1) -> Iterat
         item = (*settings, trial)
         # the folder of the parts is one of these explanations and options alone (`files.output_folder`)
         yield part(
-            item,
-            trial=trial,
-            name=" ".join(item),
-            recipe=settings,
-            content="",
-            first=number,
-            frames=maps * len(rows),
+            item, trial=trial, name=" ".join(item), recipe=settings, content="", first=number, frames=maps * len(rows)
         )
 
 
-def join_trials(
-    explained: Explanation, pieces: Sequence[Mapping[str, np.ndarray]], *, axis: int = 0
-) -> dict[str, np.ndarray]:
-    """Arrays of all frames along an axis, from those of each trial (`trial_parts`)."""
+def join_trials(explained: Explanation, pieces: Sequence[TrialArrays]) -> dict[str, np.ndarray]:
+    """Arrays of all frames, from those of each trial (`trial_parts`)."""
     order = np.argsort([row for rows in explained.trials.values() for row in rows])
-    return {name: np.concatenate([piece[name] for piece in pieces], axis=axis).take(order, axis) for name in pieces[0]}
+    return {name: np.concatenate([piece.arrays[name] for piece in pieces])[order] for name in pieces[0].arrays}

@@ -5,38 +5,66 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Float64, Int, Int64, Shaped, UInt8
 from scipy.stats import spearmanr
 from torch import Tensor
 
 from sliplens.explainers.attribution import change_of
 from sliplens.explainers.explain import network_inputs, network_references
-from sliplens.explainers.occlusion import marker_regions
+from sliplens.explainers.occlusion import marker_regions, to_network_px
 from sliplens.explainers.shapley import shapley_values
 from sliplens.faithfulness import removal
-from sliplens.faithfulness.controls import lead_over_controls, relevance_mass
+from sliplens.faithfulness.controls import Maps, lead_over_controls, relevance_mass
 from sliplens.faithfulness.fills import get_fill
 from sliplens.faithfulness.removal import SHARES, Redraw
-from sliplens.faithfulness.scoring import prepare_passes, require_same_network
-from sliplens.intervals import Difference, mean_interval, paired_difference
+from sliplens.faithfulness.scoring import frame_columns, prepare_passes, require_same_network
+from sliplens.intervals import Difference, mean_interval
 from sliplens.models import Network
 from sliplens.progress import ignore, reporting
 from sliplens.recordings import Dataset, Recording
 from sliplens.results.explanation import ExplainedFrame, Explanation
 from sliplens.results.faithfulness import CHANCE, RemovalCurve, is_control
-from sliplens.results.study import Localisation, MarkerEffects, MetaTest, NeutralScores, Truth
+from sliplens.results.study import REDRAWN, Localisation, MarkerEffects, MetaTest, NeutralScores, Truth
 from sliplens.runner import Part, part
 from sliplens.simulation.filming import Film
 from sliplens.simulation.trials import put_markers_back, rebuild_trial, visible_markers
-from sliplens.study.neutral import (
-    GROUPS,
-    correlate_groups,
-    draw_groups,
-    marker_sums,
-    neutral_frame,
-)
+from sliplens.study.choice import marker_sums
 from sliplens.study.stages import MakeRecord, Stage
+
+GROUPS, GROUP_MARKERS = 24, 5
+"""Groups of a frame, and markers of a group."""
+MOVED_TO, MOVED_FAR, HIGH = 0.85, 0.3, 0.8
+"""Margin to which markers are moved; margin for frames above the third one, which lie too near to the first."""
+
+
+def neutral_frame(margins: Float[np.ndarray, " frames"], frame: int) -> int:
+    """Find the frame of a trial to whose places the markers of a frame are moved; it lies before the first slip."""
+    slips = np.flatnonzero(margins <= 0)
+    before = margins[: slips[0]] if len(slips) and np.isfinite(margins[: slips[0]]).any() else margins
+    wanted = MOVED_FAR if margins[frame] > HIGH else MOVED_TO
+    return int(np.nanargmin(np.abs(before - wanted)))
+
+
+def draw_groups(markers: int, *, rng: np.random.Generator) -> Int64[np.ndarray, "groups members"]:
+    """Draw random groups of a frame's markers."""
+    size = min(GROUP_MARKERS, markers)
+    return np.stack([rng.choice(markers, size, replace=False) for _ in range(GROUPS)])
+
+
+def correlate_groups(
+    values: Float[np.ndarray, " markers"],
+    groups: Int[np.ndarray, "groups members"],
+    effects: Float[np.ndarray, " groups"],
+) -> float:
+    """Pearson's correlation of the sums of marker values over groups with the effects of these.
+
+    NaN where the effects do not vary, so that nothing can be judged; 0 where the sums do not.
+    """
+    sums = values[groups].sum(axis=1)
+    if len(effects) < 2 or np.ptp(effects) == 0:
+        return float("nan")
+    return 0.0 if np.ptp(sums) == 0 else float(np.corrcoef(sums, effects)[0, 1])
+
 
 _RIM_PX = 1.5
 """How far a marker's edge reaches on either side of its outline, in pixels of the network's input."""
@@ -92,6 +120,7 @@ def _stage(explained: ExplainedFrame, film: Film, recording: Recording, *, size:
     height, width = contact_map.shape
     scale, steps = size / width, np.arange(size)
     centres_px, radius_px = film.outlines(number)
+    network_px = to_network_px(centres_px[markers], contact_map.shape, image_size=size)
 
     def from_outline(centres_px: np.ndarray, radius_px: np.ndarray) -> Float[np.ndarray, "circles size size"]:
         # pixel centres lie at whole numbers, edges half a pixel before
@@ -103,8 +132,7 @@ def _stage(explained: ExplainedFrame, film: Film, recording: Recording, *, size:
     beyond = np.minimum(rest, now)
     place = np.full(len(centres_px), len(markers))
     place[markers] = np.arange(len(markers))
-    now_px = centres_px[markers]
-    x, y = np.clip(np.round(now_px).astype(np.int64), 0, [width - 1, height - 1]).T
+    x, y = np.clip(np.round(centres_px[markers]).astype(np.int64), 0, [width - 1, height - 1]).T
     return StagedFrame(
         explained=explained,
         number=number,
@@ -113,10 +141,10 @@ def _stage(explained: ExplainedFrame, film: Film, recording: Recording, *, size:
         film=film,
         reference=recording.reference,
         markers=markers,
-        regions=marker_regions((size, size), torch.from_numpy((now_px + 0.5) * scale - 0.5)).numpy(),
+        regions=marker_regions((size, size), network_px).numpy(),
         units=np.where(beyond.min(axis=0) <= _RIM_PX, place[beyond.argmin(axis=0)], len(markers)),
         edges=np.minimum(np.abs(rest), np.abs(now)).min(axis=0) <= _RIM_PX,
-        now_px=(now_px + 0.5) * scale - 0.5,
+        now_px=network_px.numpy(),
         state=contact_map[y, x].astype(np.int64),
     )
 
@@ -129,24 +157,20 @@ def redrawing(trained: Network, frames: Sequence[StagedFrame], *, to: Sequence[i
 
     def redraw(image: int, back: Bool[np.ndarray, "variants markers"]) -> Float[Tensor, "variants colours size size"]:
         frame = frames[image]
-        film = frame.film
-        every = np.zeros((len(back), len(film.marker_rest_px)), dtype=bool)
+        every = np.zeros((len(back), len(frame.film.marker_rest_px)), dtype=bool)
         every[:, frame.markers] = back
-        drawn = put_markers_back(film, frame.number, every, to=to[image] if to else None).draw_all()
+        drawn = put_markers_back(frame.film, frame.number, every, to=to[image] if to else None).draw_all()
         return trained.encode(drawn, frame.reference).to(trained.device)
 
     return redraw
 
 
-TRUE_FILL = "true"
 ORACLE, DEGRADED = "oracle", "degraded-oracle"
 TRUTH_PAIRS = 200
 """Pairs of scenes for the Shapley values of a frame: their standard error is then about a third of their spread."""
 
 _EFFECTS = ("stick", "shapley")
 """Effects that a map is compared with, as `MarkerEffects` and `Localisation` name it."""
-
-Maps = Float[np.ndarray, "frames size size"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -248,10 +272,6 @@ class JudgingByTruth(Stage[Truth]):
     """Number of pairs of scenes behind the Shapley values of a frame and game; at least two a marker are taken."""
     seed: int = 0
 
-    def __post_init__(self) -> None:
-        for fill in self.fills:
-            get_fill(fill)
-
     def parts(self) -> Iterator[Part]:
         """Yield all frames."""
         for index, frame in enumerate(self.explained.frames):
@@ -294,32 +314,29 @@ class JudgingByTruth(Stage[Truth]):
             change = removal.unit_means(
                 change_of(inputs[index], references[index]).cpu().double().numpy(), frame.units
             )[:count]
-            maps = [towards * values, towards * shuffled, change]
-            orders = [
-                removal.unit_order(frame.paint(values), frame.units, least_first=least)
-                for values in maps
-                for least in (False, True)
-            ]
+            maps = {"oracle": towards * values, "shuffled": towards * shuffled, "change": change}
+            painted = {name: frame.paint(values)[None] for name, values in maps.items()}
+            options = {"rng": rng, "towards": explained.towards[index, None], "random_orders": 0}
             with reporting(ignore):  # a part is a frame, whatever its passes
                 curves = {
-                    name: removal.removal_curves(
+                    name: removal.score_maps(
                         predict,
-                        inputs[index : index + 1],
-                        np.stack(orders)[:, None],
+                        inputs[index, None],
+                        painted,
+                        [frame.units],
                         fill=get_fill(name),
-                        references=references[index : index + 1],
+                        references=references[index, None],
                         areas=SHARES,
+                        **options,
                     )
                     for name in fills
                 }
-                by_marker = np.concatenate([removal.influence_orders(values[None]) for values in maps])
-                curves[TRUE_FILL] = removal.marker_curves(
-                    predict, lambda _, back: put_to_baseline(index, back), by_marker
+                curves[REDRAWN.fill] = removal.score_maps_by_marker(
+                    predict,
+                    lambda _, back: put_to_baseline(index, back),
+                    {name: values[None] for name, values in maps.items()},
+                    **options,
                 )
-            lost = {
-                name: np.trapezoid(curve.lost(np.array([towards]))[:, 0], curve.areas, axis=-1)
-                for name, curve in curves.items()
-            }
             return FrameEffects(
                 shapley=estimate.values,
                 shapley_error=estimate.standard_errors,
@@ -327,7 +344,10 @@ class JudgingByTruth(Stage[Truth]):
                 groups=groups,
                 moved=moved[0] - moved[1:],
                 shuffled=shuffled,
-                gains={name: areas[::2] - areas[1::2] for name, areas in lost.items()},
+                gains={
+                    fill: np.concatenate([curve.symmetric_gain for curve in of_fill.values()])
+                    for fill, of_fill in curves.items()
+                },
             )
 
         return put_back
@@ -344,7 +364,8 @@ class JudgingByTruth(Stage[Truth]):
         ]
         exact = {ORACLE: [rows["oracle"] for rows in along], DEGRADED: [rows["shuffled"] for rows in along]}
         judged = dict(self.maps) | {CHANCE: np.random.default_rng(seed).random((len(frames), size, size))}
-        judged |= {name: _paint(frames, values) for name, values in exact.items()}
+        for name, values in exact.items():
+            judged[name] = np.stack([frame.paint(value) for frame, value in zip(frames, values, strict=True)])
         values = {
             name: [
                 marker_sums(rows, frame.regions, markers=len(frame.markers))
@@ -359,7 +380,8 @@ class JudgingByTruth(Stage[Truth]):
             for name, rows in values.items()
         }
         interval = partial(mean_of_defined, clusters=explained.clusters, seed=seed)
-        rows, methods = explained.frames, len(neutral)
+        counts = [len(frame.markers) for frame in frames]
+        x_px, y_px = np.concatenate([frame.now_px for frame in frames]).T
         return Truth(
             input=explained.input,
             source=explained.source,
@@ -367,11 +389,20 @@ class JudgingByTruth(Stage[Truth]):
             methods=_judge(judged, frames, along, neutral, explained.clusters, seed=seed),
             pairs=pairs,
             meta=meta_test(effects, interval),
-            effects=MarkerEffects.joined([_tabulate(*pair) for pair in zip(frames, effects, strict=True)]),
+            effects=MarkerEffects(
+                **frame_columns(explained, counts),
+                safety_margin=np.repeat([frame.safety_margin for frame in frames], counts),
+                marker=np.concatenate([frame.markers for frame in frames]).astype(np.int64),
+                x_px=x_px,
+                y_px=y_px,
+                **{
+                    name: np.concatenate([getattr(effect, name) for effect in effects])
+                    for name in (*_EFFECTS, "shapley_error")
+                },
+                state=np.concatenate([frame.state for frame in frames]),
+            ),
             neutral=NeutralScores(
-                frame_id=np.tile([frame.id for frame in rows], methods),
-                day=np.tile([frame.day for frame in rows], methods),
-                trial=np.tile([frame.trial for frame in rows], methods),
+                **{name: np.tile(column, len(neutral)) for name, column in frame_columns(explained, 1).items()},
                 method=np.repeat(list(neutral), len(frames)),
                 correlation=np.concatenate(list(neutral.values())),
             ),
@@ -396,21 +427,16 @@ def _judge(
         for name, rows in ranks.items()
         if is_control(name) and name != CHANCE and valid.any()
     }
-    rng, records = np.random.default_rng(seed), {}
-    interval = partial(mean_of_defined, clusters=clusters, seed=seed, limits=(-1.0, 1.0))
-    methods = [name for name in maps if not is_control(name) and name not in (ORACLE, DEGRADED) and valid.any()]
+    interval, records = partial(mean_of_defined, clusters=clusters, seed=seed, limits=(-1.0, 1.0)), {}
     for name, values in maps.items():
         means = marker_means(values, frames)
-        positive = np.clip(values.astype(np.float64), 0, None)
-        lead, over = None, {}
-        if name in methods:
+        positive, lead = np.clip(values.astype(np.float64), 0, None), None
+        if not is_control(name) and name not in (ORACLE, DEGRADED) and valid.any():
+            rng = np.random.default_rng(seed)
             lead = lead_over_controls(ranks[name], controls, clusters=of_valid, rng=rng)
-            others = [method for method in methods if method != name]
-            over = {key: paired_difference(ranks[name], ranks[key], clusters=of_valid, rng=rng) for key in others}
         records[name] = Localisation(
             neutral=interval(neutral[name]),
             lead_over_controls=lead,
-            lead_over_methods=over,
             edges=interval(
                 relevance_mass(rows, frame.edges) - frame.edges.mean()
                 for rows, frame in zip(positive, frames, strict=True)
@@ -423,23 +449,6 @@ def _judge(
             },
         )
     return records
-
-
-def _tabulate(frame: StagedFrame, effect: FrameEffects) -> MarkerEffects:
-    count = len(frame.markers)
-    return MarkerEffects(
-        frame_id=np.repeat(frame.explained.id, count),
-        day=np.repeat(frame.explained.day, count),
-        trial=np.repeat(frame.explained.trial, count),
-        safety_margin=np.repeat(frame.safety_margin, count),
-        marker=frame.markers.astype(np.int64),
-        x_px=frame.now_px[:, 0],
-        y_px=frame.now_px[:, 1],
-        shapley=effect.shapley,
-        shapley_error=effect.shapley_error,
-        stick=effect.stick,
-        state=frame.state,
-    )
 
 
 def true_curves(
@@ -463,7 +472,3 @@ def true_curves(
         towards=explained.towards,
         random_orders=random_orders,
     )
-
-
-def _paint(frames: Sequence[StagedFrame], values: Sequence[Float[np.ndarray, " markers"]]) -> Maps:
-    return np.stack([frame.paint(value) for frame, value in zip(frames, values, strict=True)])
