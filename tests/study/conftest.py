@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sliplens.explainers.contract import Explainer
 from sliplens.explainers.explain import explain_frames
 from sliplens.explainers.frames import frames_at
 from sliplens.models import Network, load
 from sliplens.recordings import Dataset
+from sliplens.results.explanation import Explanation
 from sliplens.results.study import Choice, MarkerTable, StudyConfig
-from sliplens.study.choice import Material, choose_frames, gather, study_explainers
-
-METHODS = ("grad-cam", "integrated-gradients")
+from sliplens.study.choice import choose_frames, study_explainers
 
 
 def marker_table(rest: np.ndarray, now: np.ndarray) -> MarkerTable:
@@ -32,15 +32,19 @@ def choice(network: Network, fine_dataset: Dataset) -> Choice:
 
 
 @pytest.fixture(scope="session")
-def material(network: Network, fine_dataset: Dataset, choice: Choice) -> Material:
-    """Six scored frames of two trials, their maps, and a grid of markers that does not move."""
-    explainers = study_explainers(METHODS)
-    chosen = frames_at(network, fine_dataset, [(frame.trial, frame.frame) for frame in choice.frames])
+def explainers() -> dict[str, Explainer]:
+    return study_explainers(("grad-cam", "integrated-gradients"))
+
+
+@pytest.fixture(scope="session")
+def explained(network: Network, fine_dataset: Dataset, choice: Choice, explainers: dict[str, Explainer]) -> Explanation:
+    """Maps of six scored frames of two trials."""
+    places = [(frame.trial, frame.frame) for frame in choice.frames if frame.scored]
+    return explain_frames(network, frames_at(network, fine_dataset, places), explainers)
+
+
+@pytest.fixture(scope="session")
+def markers(choice: Choice) -> dict[str, MarkerTable]:
+    """A grid of markers that does not move."""
     grid = np.stack(np.meshgrid(np.arange(6, 48, 9.0), np.arange(6, 48, 9.0)), axis=-1).reshape(-1, 2)
-    return gather(
-        network,
-        explain_frames(network, chosen, explainers),
-        tuple(frame for frame in choice.frames if frame.scored),
-        markers={frame.id: marker_table(grid, grid) for frame in choice.frames},
-        explainers=explainers,
-    )
+    return {frame.id: marker_table(grid, grid) for frame in choice.frames}

@@ -15,7 +15,7 @@ from sliplens.recordings import Dataset
 from sliplens.results.explanation import Explanation
 from sliplens.results.study import Choice, States, StudyConfig
 from sliplens.study import choice as choosing
-from sliplens.study.choice import Material, choose_frames, study_explainers, worth_scoring
+from sliplens.study.choice import choose_frames, study_explainers, worth_scoring
 from sliplens.study.run import load_networks
 
 from .conftest import marker_table
@@ -53,8 +53,8 @@ def test_every_trial_has_six_frames_to_look_at_and_three_to_score(choice: Choice
     assert len({pick.id for pick in choice.frames}) == len(choice.frames) == 12
 
 
-def test_frames_with_nothing_to_explain_are_not_scored(material: Material, choice: Choice):
-    explained, scored = material.explained, tuple(frame for frame in choice.frames if frame.scored)
+def test_frames_with_nothing_to_explain_are_not_scored(explained: Explanation, choice: Choice):
+    scored = tuple(frame for frame in choice.frames if frame.scored)
 
     def changing_by(*changes: float) -> Explanation:
         frames = zip(explained.frames, changes, strict=True)

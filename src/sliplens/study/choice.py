@@ -1,7 +1,7 @@
 """Trials, frames, markers and methods of a study."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import groupby
 
 import numpy as np
@@ -11,7 +11,6 @@ from torch import Tensor
 
 from sliplens.errors import ImageError, InputError, RecordingError
 from sliplens.explainers.contract import Explainer
-from sliplens.explainers.explain import network_inputs, network_references, with_markers
 from sliplens.explainers.frames import MARGIN_LEVELS as LEVELS
 from sliplens.explainers.frames import nearest_frame
 from sliplens.explainers.occlusion import RegionMethod, marker_regions, tile_regions, to_network_px
@@ -200,38 +199,21 @@ def without_markers(explainers: Mapping[str, Explainer]) -> dict[str, Explainer]
 _TILE_PX = 16
 
 
-@dataclass(frozen=True, kw_only=True)
-class Material:
-    """Explanations of some frames with all that belongs to them."""
-
-    trained: Network
-    explained: Explanation
-    inputs: Float[Tensor, "frames colours size size"]
-    """Inputs of the network, in [0, 1]."""
-    references: Float[Tensor, "frames colours size size"]
-    """Inputs of the baseline of each frame."""
-    markers: Mapping[str, MarkerTable]
-    """By frame, in camera pixels; frames in which none could be followed are absent."""
-    explainers: Mapping[str, Explainer]
-    """By name, with the options that made the maps."""
-
-    def units(self) -> dict[str, list[Units]]:
-        """Units of removal of each frame: pixels, tiles, and markers where they are known in every frame."""
-        shape = (self.inputs.shape[-2], self.inputs.shape[-1])
-        count = len(self.inputs)
-        sides = {"pixel": 1, "tile": max(1, round(_TILE_PX * shape[0] / 224))}
-        units = {name: [tile_regions(shape, tile_px=side).numpy()] * count for name, side in sides.items()}
-        if all(frame.id in self.markers for frame in self.explained.frames):
-            units["marker"] = [
-                marker_regions(shape, torch.from_numpy(centres), radius_px=reach).numpy()
-                for centres, reach in (self.places(frame.id) for frame in self.explained.frames)
-            ]
-        return units
-
-    def places(self, frame: str) -> tuple[Float[np.ndarray, "seen 2"], float]:
-        """Where the network sees the markers of a frame, and how far each one reaches (`network_places`)."""
-        size = self.trained.manifest.frame_size
-        return network_places(self.markers[frame], frame_size=size, image_size=self.inputs.shape[-1])
+def removal_units(
+    trained: Network, explained: Explanation, markers: Mapping[str, MarkerTable]
+) -> dict[str, list[Units]]:
+    """Units of removal of each frame: pixels, tiles, and markers where they are known in every frame."""
+    shape, frame_size = (explained.image_size, explained.image_size), trained.manifest.frame_size
+    sides = {"pixel": 1, "tile": max(1, round(_TILE_PX * shape[0] / 224))}
+    units = {name: [tile_regions(shape, tile_px=side).numpy()] * len(explained.frames) for name, side in sides.items()}
+    if all(frame.id in markers for frame in explained.frames):
+        seen = [
+            network_places(markers[frame.id], frame_size=frame_size, image_size=shape[0]) for frame in explained.frames
+        ]
+        units["marker"] = [
+            marker_regions(shape, torch.from_numpy(centres), radius_px=reach).numpy() for centres, reach in seen
+        ]
+    return units
 
 
 def worth_scoring(chosen: Iterable[ChosenFrame], explained: Explanation) -> tuple[ChosenFrame, ...]:
@@ -250,33 +232,11 @@ def trial_seed(seed: int, number: int) -> int:
     return 1000 * seed + number
 
 
-def gather(
-    trained: Network,
-    explained: Explanation,
-    chosen: tuple[ChosenFrame, ...],
-    *,
-    markers: Mapping[str, MarkerTable],
-    explainers: Mapping[str, Explainer],
-) -> Material:
-    """Gather what the scores need of the chosen frames, each of which is explained."""
-    places = {frame.id: at for at, frame in enumerate(explained.frames)}
-    counted = explained.take([places[frame.id] for frame in chosen])
-    inputs = network_inputs(trained, counted)
-    return Material(
-        trained=trained,
-        explained=counted,
-        inputs=inputs,
-        references=network_references(trained, counted),
-        markers=markers,
-        explainers=with_markers(explainers, inputs, lambda: marker_places(trained, chosen, markers)),
-    )
-
-
 def marker_places(
-    trained: Network, chosen: Sequence[ChosenFrame], markers: Mapping[str, MarkerTable]
+    trained: Network, frames: Sequence[str], markers: Mapping[str, MarkerTable]
 ) -> list[Float[Tensor, "_markers 2"]]:
     """Where the markers of each frame are, in the network's pixels; those that were not followed are left out."""
-    now = [np.stack([markers[frame.id].x_px, markers[frame.id].y_px], axis=1) for frame in chosen]
+    now = [np.stack([markers[frame].x_px, markers[frame].y_px], axis=1) for frame in frames]
     valid = [places[np.isfinite(places).all(axis=1)] for places in now]
     manifest = trained.manifest
     return [to_network_px(places, manifest.frame_size, image_size=manifest.image_size) for places in valid]

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from sliplens.codec import load_result, write_json
 from sliplens.errors import InputError
 from sliplens.explainers.contract import Explainer
-from sliplens.explainers.explain import with_markers
+from sliplens.explainers.explain import network_inputs, with_markers
 from sliplens.explainers.frames import frames_at
 from sliplens.explainers.table import RECOMMENDED_METHOD
 from sliplens.faithfulness.scoring import influences
@@ -191,7 +191,7 @@ class Records:
         return self.networks[self.network]
 
     @cached_property
-    def explainers(self) -> dict[str, Explainer]:
+    def _explainers(self) -> dict[str, Explainer]:
         """Explainers by name; tiles stand for markers where the markers of some frame are unknown."""
         explainers = choice.study_explainers(self.config.methods, budget=self.config.budget)
         everywhere = all(frame.id in self["states"].markers for frame in self["choice"].frames)
@@ -208,17 +208,27 @@ class Records:
             return str(error)
         return ""
 
+    def explainers(self, frames: Sequence[str], images: Tensor) -> dict[str, Explainer]:
+        """Explainers by name, with the markers of frames, whose network inputs are `images`."""
+        markers = self["states"].markers
+        return with_markers(self._explainers, images, lambda: choice.marker_places(self.run, frames, markers))
+
     @cached_property
-    def material(self) -> choice.Material:
+    def explained(self) -> Explanation:
         """Explanations of the frames that are scored."""
-        explained = self["explain"]
-        scored = choice.worth_scoring(self["choice"].frames, explained)
-        return choice.gather(self.run, explained, scored, markers=self["states"].markers, explainers=self.explainers)
+        every = self["explain"]
+        places = {frame.id: at for at, frame in enumerate(every.frames)}
+        return every.take([places[frame.id] for frame in choice.worth_scoring(self["choice"].frames, every)])
+
+    @property
+    def scored_explainers(self) -> dict[str, Explainer]:
+        """Explainers with the markers of the frames that are scored."""
+        return self.explainers([frame.id for frame in self.explained.frames], network_inputs(self.run, self.explained))
 
     @cached_property
     def influence(self) -> Influence:
         """Maps to rank parts by, controls included."""
-        return {**influences(self.run, self.material.explained), **self["control"].maps}
+        return {**influences(self.run, self.explained), **self["control"].maps}
 
 
 def _quick(config: StudyConfig, data: Dataset) -> StudyConfig:
@@ -285,16 +295,24 @@ def _show_trial(records: Records) -> Strip:
 
 
 def _explain(records: Records) -> Explaining:
-    run, chosen, markers = records.run, records["choice"].frames, records["states"].markers
-    places = [(frame.trial, frame.frame) for frame in chosen]
+    run, places = records.run, [(frame.trial, frame.frame) for frame in records["choice"].frames]
     frames = frames_at(run, records.data, places, baseline=records.config.baseline)
-    images = run.encoding.normalise(frames.images)
-    explainers = with_markers(records.explainers, images, lambda: choice.marker_places(run, chosen, markers))
+    explainers = records.explainers(frames.ids, run.encoding.normalise(frames.images))
     return Explaining(trained=run, chosen=replace(frames, find_markers=None), explainers=explainers)
 
 
 def _delete(records: Records) -> PixelDeletion:
-    return PixelDeletion(trained=records.run, explained=records.material.explained, seed=records.config.seed)
+    return PixelDeletion(trained=records.run, explained=records.explained, seed=records.config.seed)
+
+
+def _explain_untrained(records: Records) -> Untrained:
+    explained, explainers = records.explained, records.scored_explainers
+    return Untrained(trained=records.run, explained=explained, explainers=explainers, seed=records.config.seed)
+
+
+def _measure(records: Records) -> Any:
+    explained, markers = records.explained, records["states"].markers
+    return measure_maps(records.run, explained, records.scored_explainers, markers, seed=records.config.seed)
 
 
 def _remove(records: Records) -> Removal:
@@ -303,8 +321,8 @@ def _remove(records: Records) -> Removal:
 
     return Removal(
         trained=records.run,
-        explained=records.material.explained,
-        units=records.material.units(),
+        explained=records.explained,
+        units=choice.removal_units(records.run, records.explained, records["states"].markers),
         maps=records.influence,
         settings=SETTINGS[:1] if records.config.quick else SETTINGS,
         random_orders=STUDY_ORDERS,
@@ -315,7 +333,7 @@ def _remove(records: Records) -> Removal:
 
 def judge_by_truth(records: Records) -> JudgingByTruth:
     """Compare maps along the prediction's change with the effects of markers that are put back."""
-    explained = records.material.explained
+    explained = records.explained
     raises_only = {name for name, notes in explained.methods.items() if notes.raises_only}
     towards = explained.towards[:, None, None]
     maps = {
@@ -352,11 +370,9 @@ STUDY: dict[str, Step] = {
     **SHARED,
     "explain": Step(Explaining.title, _explain),
     "score": Step(PixelDeletion.title, _delete),
-    "control": Step(Untrained.title, lambda records: Untrained(material=records.material, seed=records.config.seed)),
+    "control": Step(Untrained.title, _explain_untrained),
     "faithfulness": Step(Removal.title, _remove),
-    "map-quality": Step(
-        "Measuring how maps look", lambda records: measure_maps(records.material, seed=records.config.seed)
-    ),
+    "map-quality": Step("Measuring how maps look", _measure),
     "truth": Step(JudgingByTruth.title, judge_by_truth),
 }
 """Steps of a study in their order."""

@@ -31,9 +31,9 @@ from sliplens.progress import open_stage, report_each, reporting
 from sliplens.results import faithfulness as records
 from sliplens.results.explanation import Explanation, load_explanation
 from sliplens.results.faithfulness import CHANCE, NEW_WEIGHTS, DeletionScores, Faithfulness, MethodGap, RemovalCurve
-from sliplens.results.study import REDRAWN, SETTINGS, MapMeasures, MapQuality, Setting, UntrainedMaps
+from sliplens.results.study import REDRAWN, SETTINGS, MapMeasures, MapQuality, MarkerTable, Setting, UntrainedMaps
 from sliplens.runner import Part
-from sliplens.study.choice import Material, trial_seed
+from sliplens.study.choice import network_places, trial_seed
 from sliplens.study.explaining import Running
 from sliplens.study.stages import MakeRecord, Stage, TrialArrays, join_trials, keep_record, mean_of_known, trial_parts
 
@@ -324,20 +324,29 @@ _FEW_CHANNELS, _FEW_PAIRS = 0.05, 100
 _FEW_FRAMES = 2  # on which infidelity and sensitivity are measured
 
 
-def measure_maps(material: Material, *, seed: int = 0) -> MapQuality:
+def measure_maps(
+    trained: Network,
+    explained: Explanation,
+    explainers: Mapping[str, Explainer],
+    markers: Mapping[str, MarkerTable],
+    *,
+    seed: int = 0,
+) -> MapQuality:
     """Measure resolution, smoothness, infidelity and sensitivity of the maps, and compare the methods' smoothness."""
-    explained, rng, model = material.explained, np.random.default_rng(seed), material.trained.model
-    few, compared = material.inputs[:_FEW_FRAMES], material.references[:_FEW_FRAMES]
+    rng, model, size = np.random.default_rng(seed), trained.model, trained.manifest.frame_size
+    few, compared = (of(trained, explained)[:_FEW_FRAMES] for of in (network_inputs, network_references))
     measures, roughness = {}, {}
-    for method in report_each(list(material.explainers)):
+    for method in report_each(list(explainers)):
         maps = explained.saliency[method].astype(np.float64)
         resolutions = [
-            controls.resolution(saliency, material.places(frame.id)[0])
+            controls.resolution(
+                saliency, network_places(markers[frame.id], frame_size=size, image_size=explained.image_size)[0]
+            )
             for saliency, frame in zip(maps, explained.frames, strict=True)
-            if frame.id in material.markers
+            if frame.id in markers
         ]
         roughness[method] = np.array([controls.total_variation(saliency) for saliency in maps])
-        explainer = _shortened(material.explainers[method])
+        explainer = _shortened(explainers[method])
 
         def explain(images: Tensor, explainer: Explainer = explainer) -> Tensor:
             references = compared.repeat_interleave(len(images) // len(compared), dim=0)
@@ -387,32 +396,30 @@ class Untrained(Stage[UntrainedMaps]):
     record = TrialArrays
     title = "Explaining networks with new weights"
 
-    material: Material
+    trained: Network
+    explained: Explanation
+    explainers: Mapping[str, Explainer]
+    """By name, with the markers of the frames."""
     seed: int = 0
-
-    @property
-    def trained(self) -> Network:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Network that was explained."""
-        return self.material.trained
 
     def parts(self) -> Iterator[Part]:
         """Yield the trials, whose maps are counted."""
-        return trial_parts(self.material.explained, maps=len(self.material.explainers))
+        return trial_parts(self.explained, maps=len(self.explainers))
 
     def prepare(self) -> MakeRecord:
         """Return the function that explains the frames of a trial with its network."""
-        material, inputs, references = self.material, self.material.inputs, self.material.references
-        shortened = {name: _shortened(explainer) for name, explainer in material.explainers.items()}
-        trials = material.explained.trials
+        inputs, references = (of(self.trained, self.explained) for of in (network_inputs, network_references))
+        shortened = {name: _shortened(explainer) for name, explainer in self.explainers.items()}
+        trials = self.explained.trials
 
         def explain(item: tuple[str]) -> TrialArrays:
             frames, seed = trials[item[-1]], trial_seed(self.seed, list(trials).index(item[-1]))
-            ((_, model),) = controls.cascade(material.trained.model, seed=seed, stages=1, images=inputs)
+            ((_, model),) = controls.cascade(self.trained.model, seed=seed, stages=1, images=inputs)
             maps: dict[str, list[np.ndarray]] = {}
             with suppress(ModelError):  # without layers that have a map
                 even = controls.even_channels(model, inputs[frames], references[frames])
                 maps["weights-1"] = list(even.cpu().numpy())
-            for name, frame in report_each(list(product(material.explainers, frames))):
+            for name, frame in report_each(list(product(shortened, frames))):
                 attribution = shortened[name](model, inputs[frame, None], reference=references[frame, None])
                 maps.setdefault(name, []).append(attribution.influence[0].float().cpu().numpy())
             return TrialArrays(arrays={name + NEW_WEIGHTS: np.stack(rows) for name, rows in maps.items()})
@@ -421,5 +428,5 @@ class Untrained(Stage[UntrainedMaps]):
 
     def join(self, records: Sequence[TrialArrays]) -> UntrainedMaps:
         """Join the maps of all frames."""
-        explained = self.material.explained
-        return UntrainedMaps(input=explained.input, source=explained.source, maps=join_trials(explained, records))
+        maps = join_trials(self.explained, records)
+        return UntrainedMaps(input=self.explained.input, source=self.explained.source, maps=maps)
