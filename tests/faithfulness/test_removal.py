@@ -1,13 +1,32 @@
-"""Removal curves against closed forms: a linear network, whose every pixel counts for itself."""
+"""Removal curves against closed forms: a linear network, whose every pixel or marker counts for itself."""
+
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from jaxtyping import Bool, Float
+from torch import Tensor
 
-from sliplens.explainers.occlusion import tile_regions
+from sliplens.errors import InputError, SaliencyError
+from sliplens.explainers.occlusion import marker_regions, tile_regions
 from sliplens.faithfulness.fills import get_fill
-from sliplens.faithfulness.removal import lost_evidence, random_unit_order, removal_curves, score_maps, unit_order
+from sliplens.faithfulness.removal import (
+    SHARES,
+    answer_scenes,
+    lost_evidence,
+    random_unit_order,
+    removal_curves,
+    score_maps,
+    score_maps_by_marker,
+    unit_means,
+    unit_order,
+)
 from sliplens.models.engines import Engine
+from sliplens.progress import reporting
 
 SIZE = 20
 IMAGES = 3
@@ -112,3 +131,155 @@ def test_a_network_that_answers_always_alike_moves_by_nothing(images: torch.Tens
     orders = np.stack([[random_unit_order(PIXELS, rng=rng)] * IMAGES])
     answers = removal_curves(lambda batch: torch.full((len(batch),), 0.3), images, orders, fill=get_fill("grey"))
     assert np.all(lost_evidence(answers, UP) == 0)
+
+
+MAPS = arrays(np.float64, (6, 9), elements=st.floats(-1, 1))
+
+
+def test_tiles_cover_the_image_and_may_be_smaller_at_its_border():
+    units = tile_regions((5, 7), tile_px=3).numpy()
+    assert units.tolist()[0] == [0, 0, 0, 1, 1, 1, 2]
+    assert units.tolist()[4] == [3, 3, 3, 4, 4, 4, 5]
+    with pytest.raises(InputError, match="tiles of 0 pixels are impossible"):
+        tile_regions((5, 7), tile_px=0).numpy()
+
+
+def test_a_pixel_belongs_to_the_nearest_marker_or_to_none():
+    centres = np.array([[2.0, 1.0], [7.0, 4.0]])  # x, y
+    units = marker_regions((6, 9), torch.from_numpy(centres), radius_px=2.0).numpy()
+    for row in range(6):
+        for column in range(9):
+            distance = np.hypot(centres[:, 0] - column, centres[:, 1] - row)
+            assert units[row, column] == (distance.argmin() if distance.min() <= 2 else 2)
+    with pytest.raises(InputError, match="two or more, and there are 0; choose tiles"):
+        marker_regions((6, 9), torch.empty(0, 2), radius_px=2.0)
+
+
+@given(MAPS, st.integers(1, 5), st.booleans())
+def test_units_go_whole_and_in_the_order_of_their_means(values: np.ndarray, size: int, least_first: bool):
+    units = tile_regions(values.shape, tile_px=size).numpy()
+    order = unit_order(values, units, least_first=least_first)
+    assert sorted(order) == list(range(values.size))
+    gone = units.ravel()[order]
+    assert np.count_nonzero(np.diff(gone)) == units.max()  # each unit once, in one piece
+    means = unit_means(values, units)[gone]
+    steps = np.diff(means)
+    assert np.all(steps >= 0) if least_first else np.all(steps <= 0)
+
+
+@given(MAPS)
+def test_single_pixels_go_by_their_value(values: np.ndarray):
+    order = unit_order(values, tile_regions(values.shape, tile_px=1).numpy())
+    np.testing.assert_array_equal(values.ravel()[order], np.sort(values.ravel())[::-1])
+
+
+def test_a_random_order_takes_units_whole_and_any_of_them_first(rng: np.random.Generator):
+    units = tile_regions((6, 6), tile_px=2).numpy()
+    orders = [random_unit_order(units, rng=rng) for _ in range(200)]
+    for order in orders:
+        assert sorted(order) == list(range(36))
+        assert np.count_nonzero(np.diff(units.ravel()[order])) == 8
+    # nine tiles: one of them never first in 200 orders has a chance of 9 (8/9)^200 = 5e-10
+    assert {int(units.ravel()[order[0]]) for order in orders} == set(range(9))
+
+
+def test_a_map_that_does_not_fit_is_refused():
+    with pytest.raises(SaliencyError, match=r"the map to rank by has shape \(4, 4\) but its image is 6 x 6"):
+        unit_order(np.zeros((4, 4)), tile_regions((6, 6), tile_px=1).numpy())
+    with pytest.raises(SaliencyError, match="NaN or infinity in 36 of 36 pixels"):
+        unit_order(np.full((6, 6), np.nan), tile_regions((6, 6), tile_px=1).numpy())
+
+
+MARKERS = 40
+
+
+class Toy:
+    """A scene whose image is a row of markers, 1 where they are moved and 0 where they are put back."""
+
+    def __init__(self, effects: np.ndarray) -> None:
+        self.weights = torch.from_numpy(effects)
+        self.drawn = 0
+
+    def redraw(self, image: int, back: Bool[np.ndarray, "variants markers"]) -> Float[Tensor, "variants 3 1 columns"]:
+        self.drawn += len(back)
+        moved = torch.from_numpy(~back).double() * self.weights[image]
+        return moved[:, None, None].expand(-1, 3, -1, -1)
+
+    @staticmethod
+    def predict(images: Tensor) -> Tensor:
+        return images[:, 0, 0].sum(dim=1)
+
+
+@pytest.fixture
+def effects(rng) -> np.ndarray:
+    """Positive: each marker that is put back lowers the answer."""
+    return rng.uniform(0.1, 1, (IMAGES, MARKERS)) / MARKERS
+
+
+def test_the_curve_is_the_sum_of_what_the_markers_did(effects, rng):
+    toy = Toy(effects)
+    found = score_maps_by_marker(toy.predict, toy.redraw, {"truth": effects}, rng=rng, towards=UP)["truth"]
+    np.testing.assert_array_equal(found.areas, SHARES)
+    for image, one in enumerate(effects):
+        falling = np.append(0, np.cumsum(np.sort(one)[::-1]))
+        rising = np.append(0, np.cumsum(np.sort(one)))
+        counts = [round(share * MARKERS) for share in SHARES]
+        np.testing.assert_allclose(found.most_first[image], falling[counts], atol=1e-12)
+        np.testing.assert_allclose(found.least_first[image], rising[counts], atol=1e-12)
+
+
+def test_in_random_orders_the_answer_falls_evenly(effects, rng):
+    toy = Toy(effects)
+    found = score_maps_by_marker(toy.predict, toy.redraw, {"truth": effects}, rng=rng, towards=UP, random_orders=400)[
+        "truth"
+    ]
+    total = effects.sum(axis=1, keepdims=True)
+    # the sum of some of 40 effects of deviation 0.26 / 40: at most 0.26 * sqrt(40) / 2 / 40, over 20 for 400 orders
+    np.testing.assert_allclose(found.random, total * found.areas, atol=5 * 0.26 * np.sqrt(40) / 2 / 40 / 20)
+
+
+def test_who_knows_more_gains_more(effects, rng):
+    toy = Toy(effects)
+    noisy = effects + rng.normal(0, effects.std(), effects.shape)
+    maps = {"truth": effects, "noisy": noisy, "opposite": -effects, "flat": np.ones_like(effects)}
+    found = score_maps_by_marker(toy.predict, toy.redraw, maps, rng=rng, towards=UP)
+    gain = {name: one.symmetric_gain for name, one in found.items()}
+    assert np.all(gain["truth"] > gain["noisy"])
+    assert np.all(gain["noisy"] > 0)
+    np.testing.assert_allclose(gain["opposite"], -gain["truth"], atol=1e-12)
+    # who tells nothing gains nothing, whatever the order in which ties fall
+    np.testing.assert_array_equal(gain["flat"], 0)
+
+
+def test_what_many_orders_ask_for_is_drawn_once(effects, rng):
+    toy = Toy(effects)
+    score_maps_by_marker(
+        toy.predict, toy.redraw, {"one": effects, "same": 2 * effects}, rng=rng, towards=UP, random_orders=1
+    )
+    # nothing back, all back, and each inner step of most first, least first and one random order
+    assert toy.drawn == IMAGES * (2 + 3 * (len(SHARES) - 2))
+
+
+def test_progress_is_told_in_images(effects, rng):
+    toy, heard = Toy(effects), []
+    with reporting(lambda *step: heard.append(step)):
+        score_maps_by_marker(toy.predict, toy.redraw, {"truth": effects}, rng=rng, towards=UP)
+    assert heard == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_a_marker_without_influence_is_refused(effects, rng):
+    toy = Toy(effects)
+    effects[1, 2] = np.nan
+    with pytest.raises(InputError, match="lime gives some marker no finite influence; leave out markers"):
+        score_maps_by_marker(toy.predict, toy.redraw, {"lime": effects}, rng=rng, towards=UP)
+
+
+def test_a_scene_is_drawn_once_for_each_choice(effects, rng):
+    toy = Toy(effects)
+    answer = answer_scenes(toy.predict, partial(toy.redraw, 1))
+    back = rng.random((8, MARKERS)) < 0.5
+    expected = (~back * effects[1]).sum(axis=1)
+    np.testing.assert_allclose(answer(np.concatenate([back, back[::-1]])), [*expected, *expected[::-1]], atol=1e-12)
+    assert toy.drawn == 8
+    np.testing.assert_allclose(answer(back[3:5]), expected[3:5], atol=1e-12)
+    assert toy.drawn == 8

@@ -1,20 +1,27 @@
-"""`explain` of a data set: its folder, interrupted and continued, in other processes, and damaged."""
+"""`explain` of a data set in a folder, the strip of a trial, and the markers that prove a map."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sliplens.errors import InputError
+import sliplens as sl
+from sliplens.errors import InputError, RecordingError
 from sliplens.explainers.explain import network_inputs
 from sliplens.explainers.frames import FrameSelection
+from sliplens.explainers.occlusion import marker_regions, to_network_px
+from sliplens.explainers.table import RECOMMENDED_METHOD
 from sliplens.files import output_folder
 from sliplens.models import Network
-from sliplens.recordings import Dataset
-from sliplens.results.explanation import Explanation, load_explanation
-from sliplens.study.explaining import explain
+from sliplens.recordings import Dataset, Recording
+from sliplens.results.explanation import Explanation, Strip, load_explanation
+from sliplens.simulation.trials import put_markers_back, rebuild_trial, visible_markers
+from sliplens.study.explaining import explain, make_strip, prove_map
+
+from ..conftest import make_recording
 
 METHODS = ("grad-cam", "integrated-gradients")
 MakeMaps = Callable[..., Explanation]
@@ -105,3 +112,104 @@ def test_a_folder_of_another_stage_is_refused(tmp_path: Path):
         (out.folder / "result.json").write_text("{}")
     with pytest.raises(InputError, match="holds no explanations; make them with sliplens explain"):
         load_explanation(tmp_path / "run")
+
+
+@pytest.fixture(scope="module")
+def strip(network: Network) -> Strip:
+    levels = (10 / 11, 6 / 11, 0.0)
+    return make_strip(network, make_recording("t"), source="simulated", levels=levels)
+
+
+def test_a_strip_shows_the_frames_nearest_to_its_levels(strip):
+    margins = strip.readings.safety_margin[list(strip.shown)]
+    # 12 frames fall evenly from 1 to 0, and the first has no contact
+    assert margins == pytest.approx([10 / 11, 6 / 11, 0.0])
+    assert np.array_equal(strip.pictures, make_recording("t").frames[list(strip.shown)])
+
+
+def test_a_strip_compares_with_the_last_frame_before_the_pull(strip, network):
+    assert strip.baseline == "stick"
+    assert strip.shown[0] == 1  # the stick frame itself
+    np.testing.assert_allclose(strip.relevance[0], 0, atol=1e-9)
+    untouched = make_strip(network, make_recording("t"), source="simulated", levels=(0.0,), baseline="untouched")
+    assert untouched.baseline == "untouched"
+
+
+def test_a_strip_is_explanation_by_the_recommended_method_of_tiles_where_no_markers_show(strip):
+    assert strip.method == RECOMMENDED_METHOD.removesuffix("-marker")
+
+
+def test_a_strip_reads_as_the_network_does(strip, network):
+    recording = make_recording("t")
+    answers = network.predict(network.encode(recording.frames, recording.reference)).numpy()
+    # float32 answers of the same passes, kept as float64
+    assert strip.readings.prediction == pytest.approx(answers, abs=1e-6)
+    assert np.isnan(strip.readings.safety_margin[0])
+
+
+def test_a_trial_without_labels_is_refused(network):
+    recording = make_recording("t")
+    recording.safety_margin[:] = np.nan
+    with pytest.raises(RecordingError, match="no labelled frame"):
+        make_strip(network, recording, source="real")
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("proof") / "data"
+    data = sl.simulate(folder, preset="thesis", dry_trials=4, wet_trials=0, days=4, frames_per_trial=24)
+    recording = data.load(data.trials[0])
+    slips = np.flatnonzero(recording.safety_margin <= 0.1)
+    stick = int(np.flatnonzero(recording.safety_margin > 0.97)[-1])
+    return data, recording, int(slips[0]), stick
+
+
+def paint(thesis, recording, film, frame, weights):
+    """Map with a weight on each visible marker, and its markers."""
+    visible, size = visible_markers(film.sensor), thesis.manifest.image_size
+    centres = to_network_px(film.marker_px[frame][visible], recording.frames.shape[1:3], image_size=size)
+    regions = marker_regions((size, size), centres).numpy()
+    values = np.append(weights(len(visible)), 0.0)
+    return visible, (values / np.bincount(regions.ravel(), minlength=len(values)))[regions].astype(np.float32)
+
+
+def test_the_fewest_markers_with_half_of_the_relevance_are_moved(scene):
+    data, recording, frame, stick = scene
+    thesis, film = sl.load("thesis-difference"), rebuild_trial(data.folder, recording)
+
+    def weights(count: int) -> np.ndarray:
+        values = np.full(count, -0.001)
+        values[[3, 5, 8]] = -0.4, -0.3, -0.2  # two hold over half of about 0.94
+        return values
+
+    visible, relevance = paint(thesis, recording, film, frame, weights)
+    proof = prove_map(
+        thesis, data.folder, recording, frame=frame, stick=stick, relevance=relevance, rng=np.random.default_rng(1)
+    )
+    assert proof is not None
+    record, drawn = proof
+    np.testing.assert_allclose(record.from_px, film.marker_px[frame][visible[[3, 5]]])
+    back = np.zeros((3, len(film.marker_rest_px)), dtype=bool)
+    back[1, visible[[3, 5]]] = back[2, visible] = True
+    images = put_markers_back(film, frame, back, to=stick).draw_all()
+    now, after, all_back = thesis.predict(thesis.encode(images, recording.reference)).tolist()
+    np.testing.assert_array_equal(drawn[0], images[1])
+    assert record.prediction == pytest.approx(now, abs=1e-6)
+    assert record.change == pytest.approx(now - after, abs=1e-6)
+    assert record.change_all == pytest.approx(now - all_back, abs=1e-6)
+    assert now < all_back  # a slipping frame, and the same with its markers where they stuck
+    assert np.isfinite(record.change_random)
+
+
+def test_a_map_that_supports_nothing_and_a_trial_that_is_not_simulated_prove_nothing(scene):
+    data, recording, frame, stick = scene
+    thesis, film = sl.load("thesis-difference"), rebuild_trial(data.folder, recording)
+    _, opposing = paint(thesis, recording, film, frame, lambda count: np.full(count, 0.1))
+
+    def prove(trial: Recording, relevance: np.ndarray) -> object:
+        rng = np.random.default_rng(0)
+        return prove_map(thesis, data.folder, trial, frame=frame, stick=stick, relevance=relevance, rng=rng)
+
+    assert prove(recording, opposing) is None
+    assert prove(recording, -opposing) is not None
+    assert prove(replace(recording, truth=None), -opposing) is None
