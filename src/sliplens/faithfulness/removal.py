@@ -61,18 +61,15 @@ def influence_orders(influence: Float[np.ndarray, "images markers"]) -> Int[np.n
     return np.stack([np.argsort(sign * influence, axis=-1, kind="stable") for sign in (-1, 1)])
 
 
-def lost_evidence(
-    answers: Float[np.ndarray, "orders images steps"], towards: Float[np.ndarray, " images"]
-) -> Float64[np.ndarray, "orders images steps"]:
-    """Changes along the sign of f(x) - f(baseline): how much of the supporting evidence is removed."""
-    return towards[:, None] * (answers[..., :1] - answers)
-
-
 def _name_curves(
-    names: Iterable[str], lost: Float64[np.ndarray, "orders images steps"], areas: Sequence[float]
+    names: Iterable[str],
+    answers: Float64[np.ndarray, "orders images steps"],
+    areas: Sequence[float],
+    towards: Float[np.ndarray, " images"],
 ) -> dict[str, RemovalCurve]:
-    """Name the curves: most, then least influential first for each method, then the random orders."""
+    """Name the changes towards the baseline: most, then least influential first for each method, then at random."""
     names, shares = list(names), np.asarray(areas, dtype=np.float64)
+    lost = towards[:, None] * (answers[..., :1] - answers)
     pairs, random = lost[: 2 * len(names)].reshape(-1, 2, *lost.shape[1:]), lost[2 * len(names) :]
     mean = random.mean(axis=0) if len(random) else np.zeros(lost.shape[1:])
     return {
@@ -193,7 +190,7 @@ def score_maps(
     answers = removal_curves(
         predict, images, np.stack(orders), fill=fill, references=references, areas=areas, seed=seed
     )
-    return _name_curves(influence, lost_evidence(answers, towards), areas)
+    return _name_curves(influence, answers, areas, towards)
 
 
 def answer_scenes(
@@ -250,4 +247,4 @@ def score_maps_by_marker(
     images, markers = orders[0].shape[1:]
     orders += [np.array([[rng.permutation(markers) for _ in range(images)]]) for _ in range(random_orders)]
     answers = marker_curves(predict, redraw, np.concatenate(orders))
-    return _name_curves(influence, lost_evidence(answers, towards), SHARES)
+    return _name_curves(influence, answers, SHARES, towards)

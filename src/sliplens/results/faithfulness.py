@@ -1,7 +1,7 @@
 """Scores of explanations: by deletion as the thesis does, and by removal against controls."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated
 
@@ -232,6 +232,11 @@ class Faithfulness(OfOutput):
         if self.deletion is None or self.deletion_table is None:
             return None
         return DeletionScores(input=self.input, source=self.source, table=self.deletion_table, **vars(self.deletion))
+
+    def with_deletion(self, scores: DeletionScores) -> "Faithfulness":
+        """Return these scores with the deletion score of the thesis."""
+        short = Deletion(fill=scores.fill, steps=scores.steps, methods=scores.methods, alarms=scores.alarms)
+        return replace(self, deletion=short, deletion_table=scores.table)
 
     def score(self, method: str) -> RemovalScore:
         """Return the score of a method or control under the first fill and unit."""

@@ -3,7 +3,7 @@
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import combinations, product
 from pathlib import Path
 from typing import Literal, TypeAlias, Unpack
@@ -28,7 +28,6 @@ from sliplens.intervals import paired_difference
 from sliplens.models import Network
 from sliplens.models.wrapping import open_run
 from sliplens.progress import open_stage, report_each, reporting
-from sliplens.results import faithfulness as records
 from sliplens.results.explanation import Explanation, load_explanation
 from sliplens.results.faithfulness import CHANCE, NEW_WEIGHTS, DeletionScores, Faithfulness, MethodGap, RemovalCurve
 from sliplens.results.study import REDRAWN, SETTINGS, MapMeasures, MapQuality, MarkerTable, Setting, UntrainedMaps
@@ -156,8 +155,7 @@ def score(
                 results.append(stage.make(parts, on=running.get("on", "serial")))
         faithfulness, *deletions = results
         for scores in deletions:
-            deletion = records.Deletion(**{each.name: getattr(scores, each.name) for each in fields(records.Deletion)})
-            faithfulness = replace(faithfulness, deletion=deletion, deletion_table=scores.table)
+            faithfulness = faithfulness.with_deletion(scores)
         return faithfulness
 
     with reporting(running.get("on_progress")):
