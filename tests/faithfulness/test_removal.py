@@ -13,17 +13,9 @@ from torch import Tensor
 
 from sliplens.errors import InputError, SaliencyError
 from sliplens.explainers.occlusion import marker_regions, tile_regions
+from sliplens.faithfulness import removal
 from sliplens.faithfulness.fills import get_fill
-from sliplens.faithfulness.removal import (
-    SHARES,
-    answer_scenes,
-    random_unit_order,
-    removal_curves,
-    score_maps,
-    score_maps_by_marker,
-    unit_means,
-    unit_order,
-)
+from sliplens.faithfulness.removal import SHARES
 from sliplens.models.engines import Engine
 from sliplens.progress import reporting
 
@@ -56,8 +48,10 @@ def contributions(images: torch.Tensor, weights: torch.Tensor) -> np.ndarray:
 def test_the_curve_of_a_linear_network_is_the_sum_of_what_went(images: torch.Tensor, weights: torch.Tensor):
     values = contributions(images, weights)
     units = PIXELS
-    orders = np.stack([[unit_order(one, units, least_first=least) for one in values] for least in (False, True)])
-    answers = removal_curves(linear(weights), images, orders, fill=get_fill("black"), areas=EVERY)
+    orders = np.stack(
+        [[removal.unit_order(one, units, least_first=least) for one in values] for least in (False, True)]
+    )
+    answers = removal.removal_curves(linear(weights), images, orders, fill=get_fill("black"), areas=EVERY)
     lost = answers[..., :1] - answers
     for index, one in enumerate(values):
         falling = np.sort(one.ravel())[::-1]
@@ -69,7 +63,9 @@ def test_what_contributes_is_the_best_map_there_is(images: torch.Tensor, weights
     values = contributions(images, weights)
     units = [PIXELS] * IMAGES
     maps = {"truth": values, "noisy": values + rng.normal(0, values.std(), values.shape), "opposite": -values}
-    scores = score_maps(linear(weights), images, maps, units, fill=get_fill("black"), rng=rng, towards=UP, areas=EVERY)
+    scores = removal.score_maps(
+        linear(weights), images, maps, units, fill=get_fill("black"), rng=rng, towards=UP, areas=EVERY
+    )
     truth, noisy, opposite = (scores[name] for name in maps)
     assert np.all(truth.symmetric_gain > noisy.symmetric_gain)
     assert np.all(noisy.symmetric_gain > 0)
@@ -97,7 +93,7 @@ def test_along_the_target_a_signed_map_is_scored_as_what_it_is(images: torch.Ten
     shuffled[:, half] = shuffled[:, rng.permutation(half)]
     maps = {"truth": -values, "half": -shuffled.reshape(values.shape)}
     told = {"fill": get_fill("black"), "rng": rng, "areas": EVERY, "random_orders": 2}
-    scores = score_maps(linear(mixed), images, maps, units, towards=towards, **told)
+    scores = removal.score_maps(linear(mixed), images, maps, units, towards=towards, **told)
     falling = -np.sort((-values).reshape(IMAGES, -1), axis=1)[:, ::-1]
     lost = np.concatenate([np.zeros((IMAGES, 1)), np.cumsum(-falling, axis=1)], axis=1)
     np.testing.assert_allclose(scores["truth"].most_first, lost, atol=1e-12)
@@ -111,7 +107,7 @@ def test_along_the_target_a_signed_map_is_scored_as_what_it_is(images: torch.Ten
 
 
 def test_the_batch_size_changes_nothing(images: torch.Tensor, weights: torch.Tensor, rng):
-    orders = np.stack([[random_unit_order(PIXELS, rng=rng)] * IMAGES for _ in range(3)])
+    orders = np.stack([[removal.random_unit_order(PIXELS, rng=rng)] * IMAGES for _ in range(3)])
 
     def curves(fill: str, size: int) -> np.ndarray:
         engine = Engine(
@@ -119,7 +115,7 @@ def test_the_batch_size_changes_nothing(images: torch.Tensor, weights: torch.Ten
             batch_size=size,
             answers=lambda batches: ((linear(weights)(batch).sin(),) for batch in batches),
         )
-        return removal_curves(engine, images, orders, fill=get_fill(fill), seed=4)
+        return removal.removal_curves(engine, images, orders, fill=get_fill(fill), seed=4)
 
     # noise is solved by iterations that stop when all of a batch are done: within their tolerance, times the weights
     for fill, tolerance in (("grey", 1e-12), ("noisy-linear", 1e-3)):
@@ -128,8 +124,10 @@ def test_the_batch_size_changes_nothing(images: torch.Tensor, weights: torch.Ten
 
 
 def test_a_network_that_answers_always_alike_moves_by_nothing(images: torch.Tensor, rng):
-    orders = np.stack([[random_unit_order(PIXELS, rng=rng)] * IMAGES])
-    answers = removal_curves(lambda batch: torch.full((len(batch),), 0.3), images, orders, fill=get_fill("grey"))
+    orders = np.stack([[removal.random_unit_order(PIXELS, rng=rng)] * IMAGES])
+    answers = removal.removal_curves(
+        lambda batch: torch.full((len(batch),), 0.3), images, orders, fill=get_fill("grey")
+    )
     assert np.all(answers == answers[..., :1])
 
 
@@ -158,24 +156,24 @@ def test_a_pixel_belongs_to_the_nearest_marker_or_to_none():
 @given(MAPS, st.integers(1, 5), st.booleans())
 def test_units_go_whole_and_in_the_order_of_their_means(values: np.ndarray, size: int, least_first: bool):
     units = tile_regions(values.shape, tile_px=size).numpy()
-    order = unit_order(values, units, least_first=least_first)
+    order = removal.unit_order(values, units, least_first=least_first)
     assert sorted(order) == list(range(values.size))
     gone = units.ravel()[order]
     assert np.count_nonzero(np.diff(gone)) == units.max()  # each unit once, in one piece
-    means = unit_means(values, units)[gone]
+    means = removal.unit_means(values, units)[gone]
     steps = np.diff(means)
     assert np.all(steps >= 0) if least_first else np.all(steps <= 0)
 
 
 @given(MAPS)
 def test_single_pixels_go_by_their_value(values: np.ndarray):
-    order = unit_order(values, tile_regions(values.shape, tile_px=1).numpy())
+    order = removal.unit_order(values, tile_regions(values.shape, tile_px=1).numpy())
     np.testing.assert_array_equal(values.ravel()[order], np.sort(values.ravel())[::-1])
 
 
 def test_a_random_order_takes_units_whole_and_any_of_them_first(rng: np.random.Generator):
     units = tile_regions((6, 6), tile_px=2).numpy()
-    orders = [random_unit_order(units, rng=rng) for _ in range(200)]
+    orders = [removal.random_unit_order(units, rng=rng) for _ in range(200)]
     for order in orders:
         assert sorted(order) == list(range(36))
         assert np.count_nonzero(np.diff(units.ravel()[order])) == 8
@@ -185,9 +183,9 @@ def test_a_random_order_takes_units_whole_and_any_of_them_first(rng: np.random.G
 
 def test_a_map_that_does_not_fit_is_refused():
     with pytest.raises(SaliencyError, match=r"the map to rank by has shape \(4, 4\) but its image is 6 x 6"):
-        unit_order(np.zeros((4, 4)), tile_regions((6, 6), tile_px=1).numpy())
+        removal.unit_order(np.zeros((4, 4)), tile_regions((6, 6), tile_px=1).numpy())
     with pytest.raises(SaliencyError, match="NaN or infinity in 36 of 36 pixels"):
-        unit_order(np.full((6, 6), np.nan), tile_regions((6, 6), tile_px=1).numpy())
+        removal.unit_order(np.full((6, 6), np.nan), tile_regions((6, 6), tile_px=1).numpy())
 
 
 MARKERS = 40
@@ -218,7 +216,7 @@ def effects(rng) -> np.ndarray:
 
 def test_the_curve_is_the_sum_of_what_the_markers_did(effects, rng):
     toy = Toy(effects)
-    found = score_maps_by_marker(toy.predict, toy.redraw, {"truth": effects}, rng=rng, towards=UP)["truth"]
+    found = removal.score_maps_by_marker(toy.predict, toy.redraw, {"truth": effects}, rng=rng, towards=UP)["truth"]
     np.testing.assert_array_equal(found.areas, SHARES)
     for image, one in enumerate(effects):
         falling = np.append(0, np.cumsum(np.sort(one)[::-1]))
@@ -230,9 +228,9 @@ def test_the_curve_is_the_sum_of_what_the_markers_did(effects, rng):
 
 def test_in_random_orders_the_answer_falls_evenly(effects, rng):
     toy = Toy(effects)
-    found = score_maps_by_marker(toy.predict, toy.redraw, {"truth": effects}, rng=rng, towards=UP, random_orders=400)[
-        "truth"
-    ]
+    found = removal.score_maps_by_marker(
+        toy.predict, toy.redraw, {"truth": effects}, rng=rng, towards=UP, random_orders=400
+    )["truth"]
     total = effects.sum(axis=1, keepdims=True)
     # the sum of some of 40 effects of deviation 0.26 / 40: at most 0.26 * sqrt(40) / 2 / 40, over 20 for 400 orders
     np.testing.assert_allclose(found.random, total * found.areas, atol=5 * 0.26 * np.sqrt(40) / 2 / 40 / 20)
@@ -242,7 +240,7 @@ def test_who_knows_more_gains_more(effects, rng):
     toy = Toy(effects)
     noisy = effects + rng.normal(0, effects.std(), effects.shape)
     maps = {"truth": effects, "noisy": noisy, "opposite": -effects, "flat": np.ones_like(effects)}
-    found = score_maps_by_marker(toy.predict, toy.redraw, maps, rng=rng, towards=UP)
+    found = removal.score_maps_by_marker(toy.predict, toy.redraw, maps, rng=rng, towards=UP)
     gain = {name: one.symmetric_gain for name, one in found.items()}
     assert np.all(gain["truth"] > gain["noisy"])
     assert np.all(gain["noisy"] > 0)
@@ -253,7 +251,7 @@ def test_who_knows_more_gains_more(effects, rng):
 
 def test_what_many_orders_ask_for_is_drawn_once(effects, rng):
     toy = Toy(effects)
-    score_maps_by_marker(
+    removal.score_maps_by_marker(
         toy.predict, toy.redraw, {"one": effects, "same": 2 * effects}, rng=rng, towards=UP, random_orders=1
     )
     # nothing back, all back, and each inner step of most first, least first and one random order
@@ -263,7 +261,7 @@ def test_what_many_orders_ask_for_is_drawn_once(effects, rng):
 def test_progress_is_told_in_images(effects, rng):
     toy, heard = Toy(effects), []
     with reporting(lambda *step: heard.append(step)):
-        score_maps_by_marker(toy.predict, toy.redraw, {"truth": effects}, rng=rng, towards=UP)
+        removal.score_maps_by_marker(toy.predict, toy.redraw, {"truth": effects}, rng=rng, towards=UP)
     assert heard == [(1, 3), (2, 3), (3, 3)]
 
 
@@ -271,12 +269,12 @@ def test_a_marker_without_influence_is_refused(effects, rng):
     toy = Toy(effects)
     effects[1, 2] = np.nan
     with pytest.raises(InputError, match="lime gives some marker no finite influence; leave out markers"):
-        score_maps_by_marker(toy.predict, toy.redraw, {"lime": effects}, rng=rng, towards=UP)
+        removal.score_maps_by_marker(toy.predict, toy.redraw, {"lime": effects}, rng=rng, towards=UP)
 
 
 def test_a_scene_is_drawn_once_for_each_choice(effects, rng):
     toy = Toy(effects)
-    answer = answer_scenes(toy.predict, partial(toy.redraw, 1))
+    answer = removal.answer_scenes(toy.predict, partial(toy.redraw, 1))
     back = rng.random((8, MARKERS)) < 0.5
     expected = (~back * effects[1]).sum(axis=1)
     np.testing.assert_allclose(answer(np.concatenate([back, back[::-1]])), [*expected, *expected[::-1]], atol=1e-12)

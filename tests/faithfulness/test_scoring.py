@@ -15,17 +15,8 @@ from torch import Tensor, nn
 import sliplens
 from sliplens.errors import CheckpointError, InputError, SaliencyError
 from sliplens.explainers.table import get_explainer
+from sliplens.faithfulness import scoring
 from sliplens.faithfulness.removal import AREAS
-from sliplens.faithfulness.scoring import (
-    delete_pixels,
-    deletion_score,
-    deletion_steps,
-    fill_decides,
-    flat_maps,
-    follows_last_step,
-    ranking_alarms,
-    saturated,
-)
 from sliplens.models import Network
 from sliplens.models.checkpoint import Manifest
 from sliplens.results.study import Setting
@@ -233,19 +224,20 @@ def test_an_array_without_negatives_cannot_explain_a_fall_unless_it_is_called_un
 
 
 def test_a_fill_that_is_answered_like_the_image_decides():
-    told = fill_decides(np.array([0.5, 0.5, 0.9]), np.array([0.52, 0.6, 0.91]), fill="grey")
+    told = scoring.fill_decides(np.array([0.5, 0.5, 0.9]), np.array([0.52, 0.6, 0.91]), fill="grey")
     assert told == ["the fill decides in 2 of 3 frames: an image of nothing but grey is answered within 5% of the "
                     "whole frame"]  # fmt: skip
-    assert fill_decides(np.array([0.5]), np.array([0.1]), fill="grey") == []
+    assert scoring.fill_decides(np.array([0.5]), np.array([0.1]), fill="grey") == []
 
 
 def test_a_score_that_follows_its_last_step_measures_the_fill(rng: np.random.Generator):
     last = rng.uniform(size=40)
     assert (
-        "correlates with its last step by 0.9" in follows_last_step(last + 0.1 * rng.normal(size=40), last, name="D")[0]
+        "correlates with its last step by 0.9"
+        in scoring.follows_last_step(last + 0.1 * rng.normal(size=40), last, name="D")[0]
     )
-    assert follows_last_step(rng.uniform(size=400), rng.uniform(size=400), name="D") == []
-    assert follows_last_step(np.ones(5), np.arange(5.0), name="D") == []
+    assert scoring.follows_last_step(rng.uniform(size=400), rng.uniform(size=400), name="D") == []
+    assert scoring.follows_last_step(np.ones(5), np.arange(5.0), name="D") == []
 
 
 @pytest.mark.real
@@ -254,20 +246,20 @@ def test_the_recorded_scores_of_the_thesis_raise_it(chromatouch_folder: Path, me
     suffix = "-4" if method == "pcampm" else ""
     path = chromatouch_folder / "scores" / "grey" / f"del_details_{method}-diff-shufflenetv2{suffix}.csv"
     recorded = np.loadtxt(path, delimiter=",", skiprows=1, usecols=range(1, 225))
-    (told,) = follows_last_step(recorded.mean(axis=1), recorded[:, -1], name="D_AUC")
+    (told,) = scoring.follows_last_step(recorded.mean(axis=1), recorded[:, -1], name="D_AUC")
     assert f"D_AUC correlates with its last step by {tied:.2f}" in told
 
 
 def test_answers_at_an_end_move_one_way_only():
-    assert saturated(np.array([0.0, 0.5, 1.0, 1.2])) == [
+    assert scoring.saturated(np.array([0.0, 0.5, 1.0, 1.2])) == [
         "3 of 4 answers lie at an end of the margin: they can move one way only"
     ]
-    assert saturated(np.array([0.2, 0.8])) == []
+    assert scoring.saturated(np.array([0.2, 0.8])) == []
 
 
 def test_maps_that_rank_nothing_are_told():
     maps = {"good": np.random.default_rng(0).uniform(size=(2, 4, 4)), "flat": np.zeros((2, 4, 4))}
-    assert flat_maps(maps) == ["flat: 2 of 2 maps are constant and rank nothing"]
+    assert scoring.flat_maps(maps) == ["flat: 2 of 2 maps are constant and rank nothing"]
 
 
 GREY, BLUR, BLACK = (Setting(fill=fill, unit="pixel") for fill in ("grey", "blur", "black"))
@@ -275,16 +267,18 @@ GREY, BLUR, BLACK = (Setting(fill=fill, unit="pixel") for fill in ("grey", "blur
 
 def test_fills_that_rank_the_methods_otherwise_are_told():
     one = {"a": 0.1, "b": 0.2, "c": 0.3}
-    told = ranking_alarms({GREY: one, BLUR: {"a": 0.3, "b": 0.2, "c": 0.1}, BLACK: {"a": 1.0, "b": 2.0, "c": 3.0}})
+    told = scoring.ranking_alarms(
+        {GREY: one, BLUR: {"a": 0.3, "b": 0.2, "c": 0.1}, BLACK: {"a": 1.0, "b": 2.0, "c": 3.0}}
+    )
     assert len(told) == 2  # blur against each of the others
     assert "grey and blur rank the methods differently (Kendall's tau -1.00)" in told[0]
-    assert ranking_alarms({GREY: {"a": 1.0, "b": 2.0}, BLUR: {"a": 2.0, "b": 1.0}}) == []  # two are too few
+    assert scoring.ranking_alarms({GREY: {"a": 1.0, "b": 2.0}, BLUR: {"a": 2.0, "b": 1.0}}) == []  # two are too few
 
 
 def test_a_control_that_wins_is_told():
     control = "poly-cam-new-weights"
-    assert f"no more than the control {control}" in ranking_alarms({GREY: {"poly-cam": 0.2, control: 0.3}})[0]
-    assert ranking_alarms({GREY: {"poly-cam": 0.4, control: 0.3}}) == []
+    assert f"no more than the control {control}" in scoring.ranking_alarms({GREY: {"poly-cam": 0.2, control: 0.3}})[0]
+    assert scoring.ranking_alarms({GREY: {"poly-cam": 0.4, control: 0.3}}) == []
 
 
 def mean_of_pixels(images: torch.Tensor) -> torch.Tensor:
@@ -294,20 +288,20 @@ def mean_of_pixels(images: torch.Tensor) -> torch.Tensor:
 @given(st.floats(0, 1), st.floats(0, 1))
 def test_deletion_score_is_symmetric_and_one_where_nothing_changed(base: float, masked: float):
     one, other = np.array([base]), np.array([masked])
-    score = deletion_score(one, other)
-    assert score == deletion_score(other, one)
-    assert deletion_score(one, one) == 1
+    score = scoring.deletion_score(one, other)
+    assert score == scoring.deletion_score(other, one)
+    assert scoring.deletion_score(one, one) == 1
     assert 0 <= score <= 1
 
 
 def test_the_thesis_removes_224_pixels_at_each_of_224_steps():
-    steps = deletion_steps((224, 224))
+    steps = scoring.deletion_steps((224, 224))
     np.testing.assert_array_equal(steps, 224 * np.arange(1, 225))
 
 
 def test_impossible_numbers_of_steps_are_refused():
     with pytest.raises(InputError, match="deletion in 17 steps is impossible with 16 pixels; choose 1 to 16"):
-        deletion_steps((4, 4), steps=17)
+        scoring.deletion_steps((4, 4), steps=17)
 
 
 def test_so_many_pixels_of_an_order_are_gone(rng: np.random.Generator):
@@ -319,7 +313,7 @@ def test_so_many_pixels_of_an_order_are_gone(rng: np.random.Generator):
         seen.extend(batch)
         return batch.mean(dim=(1, 2, 3))
 
-    delete_pixels(look, images, order[None], fill="black", steps=30)
+    scoring.delete_pixels(look, images, order[None], fill="black", steps=30)
     for step, image in enumerate(seen[:30], start=1):
         for flat in range(30):  # one pixel at a time, the slow way
             row, column = divmod(flat, 5)
@@ -331,7 +325,7 @@ def test_curves_of_a_network_that_averages_pixels_have_a_closed_form(rng: np.ran
     # image of ones filled with black: the answer falls from 1 to 0 in a straight line whatever the order
     images = torch.ones(2, 3, 8, 8)
     orders = np.stack([rng.permutation(64) for _ in range(2)])
-    curves = delete_pixels(mean_of_pixels, images, orders, fill="black")
+    curves = scoring.delete_pixels(mean_of_pixels, images, orders, fill="black")
     expected = 1 - np.arange(1, 9) / 8
     # means of 192 float32 numbers
     np.testing.assert_allclose(curves[:, 1:], np.stack([expected, expected]), atol=1e-6)

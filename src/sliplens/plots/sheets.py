@@ -276,10 +276,7 @@ def _frame_words(recording: Recording, at: int | None, *, reference: bool) -> st
 def _write_facts(figure: Figure, recording: Recording, labelling: Labelling) -> None:
     where = f"{recording.sensor}, day {recording.day}, {recording.condition}"
     flags = labelling.basis.flags if labelling.basis else ()
-    lines = {
-        VERMILLION: [*(f"▲ {text}" for text in flags), ""],
-        BLACK: [where, *describe_labels(recording, labelling)],
-    }
+    lines = {VERMILLION: [*(f"▲ {text}" for text in flags), ""], BLACK: [where, *describe_labels(recording, labelling)]}
     figure.text(0.02, 0.95, recording.trial[:75], fontsize=14, fontweight="bold", parse_math=False)
     room, top = _MOST_LINES, 0.9
     for colour, sentences in lines.items():

@@ -112,10 +112,7 @@ def plate_moved(strip: Strip, moved: MovedMarkers) -> Plate:
     count = len(moved.from_px)
     figure = draw_pictures(
         [PictureRow(name="camera", pictures=[strip.pictures[-1], strip.redrawn[0]])],
-        heads=[
-            f"predicted {percent(moved.prediction)}",
-            f"drawn anew:\n{percent(moved.prediction - moved.change)}",
-        ],
+        heads=[f"predicted {percent(moved.prediction)}", f"drawn anew:\n{percent(moved.prediction - moved.change)}"],
     )
     ring = {"markersize": 5, "fillstyle": "none", "color": "white", "markeredgewidth": 0.8}
     for ax in figure.axes:
