@@ -26,7 +26,7 @@ from sliplens.errors import InputError
 from sliplens.grip import records as grip_records
 from sliplens.results import evaluation, explanation, faithfulness, study
 
-NEVER_LOADED = {faithfulness.DeletionCurve, faithfulness.RemovalCurve, study.MarkerPlaces}
+NEVER_LOADED = {faithfulness.DeletionCurve, faithfulness.RemovalCurve}
 """Records of `results` that are made of tables when these have been read."""
 
 
