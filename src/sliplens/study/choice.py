@@ -15,7 +15,7 @@ from sliplens.explainers.frames import MARGIN_LEVELS as LEVELS
 from sliplens.explainers.frames import nearest_frame
 from sliplens.explainers.occlusion import RegionMethod, marker_regions, tile_regions, to_network_px
 from sliplens.explainers.poly_cam import Likeness
-from sliplens.explainers.table import EXPLAINERS, get_explainer
+from sliplens.explainers.table import get_explainer
 from sliplens.faithfulness.removal import Units
 from sliplens.intervals import FEWEST_UNITS
 from sliplens.markers import track_markers
@@ -172,20 +172,15 @@ def marker_sums(
     return np.bincount(regions.ravel(), relevance.astype(np.float64).ravel(), minlength=markers + 1)[:markers]
 
 
-THESIS_POLY_CAM = "poly-cam-thesis"
 _AS_PUBLISHED: Likeness = (0.999, 0.97)
 """Of the thesis's map, compared with what was published; its weights are nearly all 1, so that this costs little."""
 
 
-def study_explainers(
-    methods: Sequence[str] = records.STUDY_METHODS, *, budget: float = records.STUDY_BUDGET
-) -> dict[str, Explainer]:
+def study_explainers(methods: Sequence[str], *, budget: float = records.STUDY_BUDGET) -> dict[str, Explainer]:
     """Explainers of a study: rows of `EXPLAINERS`, Poly-CAM with some of the channels measured at first."""
-    for name in methods:
-        EXPLAINERS.pick(name)
     rows: dict[str, Explainer] = {
         "poly-cam": get_explainer("poly-cam", budget=budget),
-        THESIS_POLY_CAM: get_explainer(THESIS_POLY_CAM, budget=budget, likeness=_AS_PUBLISHED),
+        "poly-cam-thesis": get_explainer("poly-cam-thesis", budget=budget, likeness=_AS_PUBLISHED),
     }
     return {name: rows.get(name) or get_explainer(name) for name in methods}
 
