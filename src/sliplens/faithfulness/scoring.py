@@ -1,16 +1,14 @@
 """Scores of explanations: removal under several fills, the deletion score of the thesis, and alarms."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64, Int, UInt8
+from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
-from sliplens.errors import CheckpointError, InputError, SaliencyError
-from sliplens.explainers.explain import join_maps, network_inputs, network_references
-from sliplens.explainers.frames import frames_from_arrays
+from sliplens.errors import CheckpointError, InputError
+from sliplens.explainers.explain import network_inputs, network_references
 from sliplens.faithfulness.controls import Maps, control_maps, lead_over_controls
 from sliplens.faithfulness.fills import get_fill
 from sliplens.faithfulness.removal import Predict, removal_curves
@@ -18,42 +16,11 @@ from sliplens.intervals import mean_interval, paired_difference
 from sliplens.models import Network
 from sliplens.models.engines import Engine, prepare
 from sliplens.results import faithfulness as records
-from sliplens.results.explanation import BASELINES, CLOSE, Explanation, MethodNotes, require_saliency
+from sliplens.results.explanation import BASELINES, CLOSE, Explanation
 from sliplens.results.faithfulness import CHANCE, is_control
 from sliplens.results.study import REDRAWN, Setting
 
-Frames = UInt8[np.ndarray, "images height width 3"]
 _CHECKED_IMAGES = 4
-
-
-def explanation_of_maps(
-    network: Network,
-    frames: Frames,
-    maps: Float[np.ndarray, "maps rows columns"],
-    reference: UInt8[np.ndarray, "_ _ 3"] | None,
-    *,
-    signed: bool,
-) -> Explanation:
-    """Make the record of maps that another tool computed; see `sliplens.score` for `signed`.
-
-    Raises
-    ------
-    SaliencyError
-        If a map has another size than the network's input, or holds NaN; or if a signed array has no number below zero
-        for a frame whose prediction fell.
-    """
-    explanation = join_maps(network, frames_from_arrays(network, frames, reference), {})
-    for index, values in enumerate(maps):
-        require_saliency(values, explanation.images.shape[-2:], where=f"map {index}")
-    positive = (maps.min(axis=(1, 2)) >= 0) & (maps.max(axis=(1, 2)) > 0)
-    for index in np.flatnonzero((explanation.towards < 0) & positive) if signed else ():
-        raise SaliencyError(
-            f"map {index} has no number below 0, but the prediction of its frame is lower than that of the untouched "
-            "sensor, which a signed map must explain by pixels that lower it; if its numbers say how much a pixel "
-            "matters whichever way, give signed=False"
-        )
-    notes = MethodNotes(seconds_per_frame=0.0, warnings=(), raises_only=not signed)
-    return replace(explanation, methods={"maps": notes}, relevance={"maps": maps.astype(np.float32)})
 
 
 def require_same_network(network: Network, explanation: Explanation) -> None:

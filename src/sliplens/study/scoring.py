@@ -16,7 +16,8 @@ from torch import Tensor, nn
 from sliplens.codec import load_result
 from sliplens.errors import InputError, ModelError, SaliencyError
 from sliplens.explainers.contract import Explainer
-from sliplens.explainers.explain import network_inputs, network_references
+from sliplens.explainers.explain import join_maps, network_inputs, network_references
+from sliplens.explainers.frames import frames_from_arrays
 from sliplens.explainers.gradients import IntegratedGradients
 from sliplens.explainers.occlusion import tile_regions
 from sliplens.explainers.poly_cam import PolyCam
@@ -28,7 +29,7 @@ from sliplens.intervals import paired_difference
 from sliplens.models import Network
 from sliplens.models.wrapping import open_run
 from sliplens.progress import open_stage, report_each, reporting
-from sliplens.results.explanation import Explanation, load_explanation
+from sliplens.results.explanation import Explanation, MethodNotes, load_explanation, require_saliency
 from sliplens.results.faithfulness import CHANCE, NEW_WEIGHTS, DeletionScores, Faithfulness, MethodGap, RemovalCurve
 from sliplens.results.study import REDRAWN, SETTINGS, MapMeasures, MapQuality, MarkerTable, Setting, UntrainedMaps
 from sliplens.runner import Part
@@ -181,6 +182,7 @@ def _to_score(
     *,
     signed: bool,
 ) -> Explanation:
+    """Return the explanation to score, or make the record of maps that another tool computed."""
     if isinstance(frames, Explanation):
         return frames
     if isinstance(frames, str | Path):
@@ -190,9 +192,20 @@ def _to_score(
     count = len(maps if isinstance(maps, np.ndarray) else maps.frames)
     if count != len(frames):
         raise SaliencyError(f"there are {count} maps of {len(frames)} frames; explain the frames that are scored")
-    if isinstance(maps, np.ndarray):
-        return scoring.explanation_of_maps(network, frames, maps, reference, signed=signed)
-    return maps
+    if not isinstance(maps, np.ndarray):
+        return maps
+    explanation = join_maps(network, frames_from_arrays(network, frames, reference), {})
+    for index, values in enumerate(maps):
+        require_saliency(values, explanation.images.shape[-2:], where=f"map {index}")
+    positive = (maps.min(axis=(1, 2)) >= 0) & (maps.max(axis=(1, 2)) > 0)
+    for index in np.flatnonzero((explanation.towards < 0) & positive) if signed else ():
+        raise SaliencyError(
+            f"map {index} has no number below 0, but the prediction of its frame is lower than that of the untouched "
+            "sensor, which a signed map must explain by pixels that lower it; if its numbers say how much a pixel "
+            "matters whichever way, give signed=False"
+        )
+    notes = MethodNotes(seconds_per_frame=0.0, warnings=(), raises_only=not signed)
+    return replace(explanation, methods={"maps": notes}, relevance={"maps": maps.astype(np.float32)})
 
 
 @dataclass(frozen=True, kw_only=True)
