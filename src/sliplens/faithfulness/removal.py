@@ -144,13 +144,8 @@ def removal_curves(
         done += answered
         report_progress(done * len(images) // len(jobs), len(images))
 
-    batches = _paint(
-        fill(images, references, seed),
-        orders,
-        [(image, order, removed[step]) for image, order, step in jobs],
-        images=images,
-        batch_size=engine.batch_size,
-    )
+    paint, steps = fill(images, references, seed), [(image, order, removed[step]) for image, order, step in jobs]
+    batches = _paint(paint, orders, steps, images=images, batch_size=engine.batch_size)
     answers = np.empty((len(orders), len(images), len(shares)))
     image_of, order_of, step_of = np.transpose(jobs)
     answers[order_of, image_of, step_of] = _answer(engine, batches, count)

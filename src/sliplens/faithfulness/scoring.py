@@ -17,7 +17,7 @@ from sliplens.models import Network
 from sliplens.models.engines import Engine, prepare
 from sliplens.results import faithfulness as records
 from sliplens.results.explanation import BASELINES, CLOSE, Explanation
-from sliplens.results.faithfulness import CHANCE, is_control
+from sliplens.results.faithfulness import CHANCE, RemovalCurve, is_control
 from sliplens.results.study import REDRAWN, Setting
 
 _CHECKED_IMAGES = 4
@@ -52,11 +52,7 @@ def frame_columns(explanation: Explanation, steps: int | Sequence[int]) -> dict[
 
 
 def score_curves(
-    explanation: Explanation,
-    curves: Mapping[Setting, Mapping[str, records.RemovalCurve]],
-    *,
-    random_orders: int,
-    seed: int,
+    explanation: Explanation, curves: Mapping[Setting, Mapping[str, RemovalCurve]], *, random_orders: int, seed: int
 ) -> records.Faithfulness:
     """Make the scores of the curves of all frames, by setting and map, with intervals over days and trials."""
     rng, clusters, frames = np.random.default_rng(seed), explanation.clusters, explanation.frames

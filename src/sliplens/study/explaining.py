@@ -127,14 +127,9 @@ def explain(
             EXPLAINERS.pick(name)
     network = open_run(run, device=running.get("device", "cpu"), preprocess=running.get("preprocess"))
     profile = None if sensor is None else load_profile(sensor)
+    compared = _open_baseline(baseline, profile)
     chosen = _choose(
-        network,
-        source,
-        reference,
-        select,
-        sensor=profile,
-        labels_in_names=labels_in_names,
-        baseline=_open_baseline(baseline, profile),
+        network, source, reference, select, sensor=profile, labels_in_names=labels_in_names, baseline=compared
     )
     explainers, warnings = choose_explainers(network, chosen, method, budget=budget)
     frames = number_of(len(chosen.ids), "frame")

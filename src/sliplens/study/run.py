@@ -136,15 +136,9 @@ def run_study(
         for of_network, step in product(of_networks, steps):
             _run_step(step, of_network)
         tables = {TABLES[step]: {each.network: each[step] for each in of_networks} for step in steps if step in TABLES}
-        study = Study(
-            folder=records.folder,
-            config=config,
-            choice=records["choice"],
-            states=records["states"],
-            evaluations=evaluations,
-            **tables,
-        )
-        for sentence in (records["choice"].summary, *study.left_out.values()):
+        chosen, states, folder = records["choice"], records["states"], records.folder
+        study = Study(folder=folder, config=config, choice=chosen, states=states, evaluations=evaluations, **tables)
+        for sentence in (chosen.summary, *study.left_out.values()):
             add_note(sentence)
         weakref.finalize(study, stack.pop_all().close)
         return study

@@ -311,31 +311,20 @@ class JudgingByTruth(Stage[Truth]):
                 of_stick = removal.answer_scenes(predict, partial(put_to_baseline, index))
                 stick = values = shapley_values(lambda stay: of_stick(~stay), count, pairs=pairs, rng=rng).values
             shuffled = shuffle_half(values, rng=rng)
-            change = removal.unit_means(
-                change_of(inputs[index], references[index]).cpu().double().numpy(), frame.units
-            )[:count]
+            change = change_of(inputs[index], references[index]).cpu().double().numpy()
+            change = removal.unit_means(change, frame.units)[:count]
             maps = {"oracle": towards * values, "shuffled": towards * shuffled, "change": change}
             painted = {name: frame.paint(values)[None] for name, values in maps.items()}
+            by_marker = {name: values[None] for name, values in maps.items()}
+            score_maps = partial(removal.score_maps, predict, inputs[index, None], painted, [frame.units])
             options = {"rng": rng, "towards": explained.towards[index, None], "random_orders": 0}
             with reporting(ignore):  # a part is a frame, whatever its passes
                 curves = {
-                    name: removal.score_maps(
-                        predict,
-                        inputs[index, None],
-                        painted,
-                        [frame.units],
-                        fill=get_fill(name),
-                        references=references[index, None],
-                        areas=SHARES,
-                        **options,
-                    )
+                    name: score_maps(fill=get_fill(name), references=references[index, None], areas=SHARES, **options)
                     for name in fills
                 }
                 curves[REDRAWN.fill] = removal.score_maps_by_marker(
-                    predict,
-                    lambda _, back: put_to_baseline(index, back),
-                    {name: values[None] for name, values in maps.items()},
-                    **options,
+                    predict, lambda _, back: put_to_baseline(index, back), by_marker, **options
                 )
             return FrameEffects(
                 shapley=estimate.values,
