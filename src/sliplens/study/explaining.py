@@ -240,15 +240,10 @@ class Explaining(Stage[Explanation]):
         chosen = self.chosen
         for method in self.explainers:
             for batch, rows in enumerate(chosen.batches):
+                first, trial, name = rows[0], chosen.trial[rows[0]], f"{method} of {chosen.ids[rows[0]]}"
                 # the folder of the parts is one of these frames and options alone (`files.output_folder`)
                 yield part(
-                    (method, batch),
-                    trial=chosen.trial[rows[0]],
-                    name=f"{method} of {chosen.ids[rows[0]]}",
-                    recipe=method,
-                    content="",
-                    first=rows[0],
-                    frames=len(rows),
+                    (method, batch), trial=trial, name=name, recipe=method, content="", first=first, frames=len(rows)
                 )
 
     def join(self, records: Sequence[MethodMaps]) -> Explanation:

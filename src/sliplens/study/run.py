@@ -275,16 +275,12 @@ def estimate_minutes(records: Records) -> float:
 
 def _show_trial(records: Records) -> Strip:
     """Explain the trial of the panels from stick to slip, with the first network."""
-    trial = next(frame.trial for frame in records["choice"].frames if frame.pictured)
-    method = RECOMMENDED_METHOD if RECOMMENDED_METHOD in records.config.methods else records.config.methods[0]
+    data, config, network = records.data, records.config, next(iter(records.networks.values()))
+    recording = data.load(data.find(next(frame.trial for frame in records["choice"].frames if frame.pictured)))
+    method = RECOMMENDED_METHOD if RECOMMENDED_METHOD in config.methods else config.methods[0]
+    folder = data.folder if data.simulated else None
     return make_strip(
-        next(iter(records.networks.values())),
-        records.data.load(records.data.find(trial)),
-        source=records.data.source,
-        method=method,
-        baseline=records.config.baseline,
-        folder=records.data.folder if records.data.simulated else None,
-        seed=records.config.seed,
+        network, recording, source=data.source, method=method, baseline=config.baseline, folder=folder, seed=config.seed
     )
 
 
@@ -335,13 +331,9 @@ def judge_by_truth(records: Records) -> JudgingByTruth:
         name: towards * values if name.removesuffix(NEW_WEIGHTS) in raises_only else values
         for name, values in records.influence.items()
     }
+    fills, seed = tuple(dict.fromkeys(setting.fill for setting in SETTINGS)), records.config.seed
     return JudgingByTruth(
-        trained=records.run,
-        explained=explained,
-        data=records.data,
-        maps=maps,
-        fills=tuple(dict.fromkeys(setting.fill for setting in SETTINGS)),
-        seed=records.config.seed,
+        trained=records.run, explained=explained, data=records.data, maps=maps, fills=fills, seed=seed
     )
 
 
