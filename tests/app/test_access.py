@@ -1,13 +1,11 @@
 """Who is let in, and what anybody can send before that: bounded in bytes, time and number."""
 
-import asyncio
 import re
 import socket
 import time
 from collections.abc import Iterator
 from contextlib import closing
 from http.client import HTTPConnection
-from threading import Thread
 from unittest.mock import Mock
 
 import pytest
@@ -17,8 +15,7 @@ pytest.importorskip("websockets", reason="the page needs websockets (extra live)
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from sliplens.app import access
-from sliplens.app.server import LivePage
+from sliplens.app import LivePage, server
 
 TOKEN = "a-token"
 COOKIE = {"Cookie": f"sliplens-8090={TOKEN}"}
@@ -42,7 +39,7 @@ TEXTS = (b"\x81\xfd\0\0\0\0" + b"a" * 125) * 512
 def visit(token: str | None = TOKEN, path: str = "/", **headers: str) -> tuple[int, Response]:
     """Status and answer for a visitor; 101 where a socket may open."""
     fields = {"Host": "robot:8090"} | {name.replace("_", "-"): value for name, value in headers.items()}
-    answer = access.Gate(token=token, port=8090)(None, Request(path, Headers(fields)))
+    answer = server.Gate(token=token, port=8090)(None, Request(path, Headers(fields)))
     return (101, Response(101, "", Headers())) if answer is None else (answer.status_code, answer)
 
 
@@ -112,7 +109,7 @@ def test_a_page_may_load_nothing_from_elsewhere_and_no_script_within_it_runs(hos
     ("host", "own"), [("127.0.0.1", True), ("::1", True), ("localhost", True), ("0.0.0.0", False), ("robot", False)]
 )
 def test_others_need_a_token(host: str, own: bool):
-    assert access.is_loopback(host) is own
+    assert server.is_loopback(host) is own
     assert (LivePage(Mock(), host=host).token is None) is own
 
 
@@ -122,32 +119,23 @@ def test_others_need_a_token(host: str, own: bool):
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cut short how long a request may take; to be asked for before the port."""
-    monkeypatch.setattr(access, "REQUEST_S", 0.2)
+    monkeypatch.setattr(server, "REQUEST_S", 0.2)
 
 
 @pytest.fixture(params=[None, TOKEN], ids=["open", "token"])
-def port(request: pytest.FixtureRequest) -> Iterator[int]:
+def port(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
     """Port of a page behind the gate, whose sockets take what comes, and say nothing."""
-    page = LivePage(Mock(), port=0)
-    page.token, page.feed = request.param, Mock()
 
-    async def talk(connection) -> None:
+    async def talk(_: LivePage, connection) -> None:
         async for _ in connection:
             pass
 
-    page._talk = talk
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        page._socket = listening
-        started = Mock()
-        thread = Thread(target=lambda: asyncio.run(page._serve(started)), daemon=True)
-        thread.start()
-        try:
-            while not started.set.called:
-                thread.join(0.01)
-            yield listening.getsockname()[1]
-        finally:
-            page._loop.call_soon_threadsafe(page._over.set)
-            thread.join(20)
+    monkeypatch.setattr(LivePage, "_talk", talk)
+    monkeypatch.setattr(server, "Feed", Mock())
+    page = LivePage(Mock(), port=0)
+    page.token = request.param
+    with page:
+        yield page._socket.getsockname()[1]
 
 
 def connect(port: int) -> socket.socket:
@@ -226,7 +214,7 @@ def test_a_trickle_does_not_put_off_the_end(impatient: None, port: int):
 
 
 def test_of_many_that_only_wait_the_oldest_make_room(port: int, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(access, "MOST_CONNECTIONS", 8)
+    monkeypatch.setattr(server, "MOST_CONNECTIONS", 8)
     crowd = [connect(port) for _ in range(30)]
     try:
         assert is_served(port)
@@ -238,7 +226,7 @@ def test_of_many_that_only_wait_the_oldest_make_room(port: int, monkeypatch: pyt
 
 @pytest.mark.parametrize("port", [None], indirect=True)
 def test_a_socket_that_was_let_in_stays_while_others_crowd(port: int, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(access, "MOST_CONNECTIONS", 2)
+    monkeypatch.setattr(server, "MOST_CONNECTIONS", 2)
     clients = [connect(port) for _ in range(2)]
     for client in clients:
         client.sendall(UPGRADE + b"\r\n")

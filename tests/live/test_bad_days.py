@@ -5,7 +5,7 @@ import io
 import os
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
@@ -16,68 +16,23 @@ import av.logging
 import numpy as np
 import pytest
 from PIL import Image
+from scripted import Scripted, frame_of, plain_reader
 
-import sliplens as sl
 from sliplens.errors import InputError, SourceError
-from sliplens.live import LiveOptions, StreamSource, list_cameras, loop, open_live, sources
-from sliplens.live.contract import LiveSource
+from sliplens.live import CameraSource, LiveOptions, list_cameras, loop, open_live, sources
 from sliplens.live.reading import LiveFrame, Reading
 
-plain_reader = partial(sl.LiveReader, health=None, slip=None)
-"""What is captured and read, without judging it."""
 IMAGE = np.tile(np.arange(48, dtype=np.uint8)[:, None, None], (1, 48, 3))
-Act = Callable[["Wicked"], LiveFrame | None]
+frame = partial(frame_of, IMAGE)
 
 
-def frame(number: int, *, time_s: float | None = None, image: np.ndarray = IMAGE) -> Act:
-    """Give a frame once the one before was read."""
-
-    def act(source: "Wicked") -> LiveFrame:
-        assert source.read.wait(timeout=10)
-        source.read.clear()
-        time_now_s = 0.01 * number if time_s is None else time_s
-        return LiveFrame(image=image, number=number, time_s=time_now_s, captured_s=time.monotonic())
-
-    return act
-
-
-def lost(source: "Wicked") -> None:
+def lost(source: Scripted) -> None:
     raise SourceError(f"{source.name} was unplugged; plug it in again")
 
 
-def lost_once_read(source: "Wicked") -> None:
-    assert source.read.wait(timeout=10)
+def lost_once_read(source: Scripted) -> None:
+    source.wait()
     lost(source)
-
-
-def hang(source: "Wicked") -> None:
-    source.hung.wait(timeout=10)
-
-
-class Wicked(LiveSource):
-    """Does what a script says, line after line, also after it was opened again."""
-
-    name, cure = "the fake", "give it a push"
-    sizes: tuple[tuple[int, int], ...] = ((48, 48),)
-    """Sizes of its frames, by how often it was opened."""
-
-    def __init__(self, *script: Act, reconnects: bool = True, refuses: int = 0) -> None:
-        self.script, self.reconnects, self.refuses = list(script), reconnects, refuses
-        self.read, self.hung, self.opened = Event(), Event(), 0
-        self.read.set()
-
-    def __enter__(self) -> "Wicked":
-        self.opened += 1
-        self.size = self.sizes[min(self.opened, len(self.sizes)) - 1]
-        if 1 < self.opened <= 1 + self.refuses:
-            raise SourceError(f"{self.name} is not there; plug it in")
-        return self
-
-    def frames(self) -> Iterator[LiveFrame]:
-        while self.script:
-            given = self.script.pop(0)(self)
-            if given is not None:
-                yield given
 
 
 @pytest.fixture(autouse=True)
@@ -86,34 +41,23 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loop, "_PATIENCE_S", 0.2)
 
 
-def readings_of(source: Wicked, *, stall_s: float = 5.0) -> list[Reading]:
-    heard: list[Reading] = []
-
-    def next_one(reading: Reading, _: LiveFrame | None) -> None:
-        heard.append(reading)
-        source.read.set()
-
-    reader = plain_reader(source, reference=IMAGE, stall_s=stall_s)
-    reader.subscribe(next_one)
-    with reader:
-        list(reader.readings())
-    return heard
+def readings_of(*script: LiveFrame | Callable[[Scripted], None], **settings: float) -> list[Reading]:
+    return Scripted(*script).all_readings(None, reference=IMAGE, **settings)
 
 
 def test_a_source_that_is_lost_is_opened_again_until_it_is_back():
-    source = Wicked(frame(0), lost, frame(0, time_s=7.0), frame(1, time_s=7.01), refuses=2)
-    readings = readings_of(source)
+    source = Scripted(frame(0), lost, frame(0, time_s=7.0), frame(1, time_s=7.01), refuses=2)
+    readings = source.all_readings(None, reference=IMAGE)
     assert source.opened == 4
     assert [reading.number for reading in readings] == [0, 0, 1]
     assert readings[-1].withheld is None
 
 
 def test_while_a_source_is_away_readings_say_so():
-    def back(source: Wicked) -> LiveFrame | None:
+    def told(source: Scripted) -> None:
         source.read.clear()  # only once somebody was told that it was away
-        return frame(4)(source)
 
-    readings = readings_of(Wicked(frame(3), lost_once_read, back), stall_s=0.05)
+    readings = readings_of(frame(3), lost_once_read, told, frame(4), stall_s=0.05)
     sentences = [reading.withheld for reading in readings if reading.number == 3]
     assert sentences[0] is None
     assert "the fake was unplugged; plug it in again" in sentences
@@ -121,26 +65,25 @@ def test_while_a_source_is_away_readings_say_so():
 
 
 def test_a_source_that_hangs_is_told_and_left():
-    source = Wicked(frame(0), hang, frame(1))
-    reader = plain_reader(source, reference=IMAGE, stall_s=0.05)
+    hung = Event()
+    reader = plain_reader(Scripted(frame(0), lambda _: hung.wait(10), frame(1)), reference=IMAGE, stall_s=0.05)
     with reader:
         stale = next(reading for reading in reader.readings() if reading.withheld)
         begun = time.monotonic()
     assert time.monotonic() - begun < 5  # it would hang for 10 s
     assert stale.withheld == "the fake has given no frame for 0.05 s; give it a push"
     assert stale.margin is None
-    source.hung.set()
+    hung.set()
 
 
 def test_frames_of_another_size_have_no_margin_until_they_are_as_before():
-    other = np.zeros((24, 48, 3), dtype=np.uint8)
-    readings = readings_of(Wicked(frame(0), frame(1, image=other), frame(2)))
+    readings = readings_of(frame(0), frame_of(np.zeros((24, 48, 3), dtype=np.uint8), 1), frame(2))
     assert [bool(reading.withheld) for reading in readings] == [False, True, False]
     assert "now 24 x 48 pixels, they were 48 x 48; set the camera as it was" in str(readings[1].withheld)
 
 
 def test_a_reader_reads_once_and_only_while_it_is_entered():
-    reader = plain_reader(Wicked(frame(0)), reference=IMAGE)
+    reader = plain_reader(Scripted(frame(0)), reference=IMAGE)
     with pytest.raises(InputError, match="enter the reader first"):
         next(reader.readings())
     with reader:
@@ -152,7 +95,7 @@ def test_a_reader_reads_once_and_only_while_it_is_entered():
 @pytest.mark.parametrize("jump_s", [-3.0, 0.0, 60.0, np.nan])
 def test_a_clock_that_jumps_withholds_one_frame(jump_s: float):
     times = [5.0, 5.01, 5.01 + jump_s, 5.02 + jump_s]
-    readings = readings_of(Wicked(*(frame(number, time_s=time_s) for number, time_s in enumerate(times))))
+    readings = readings_of(*(frame(number, time_s=time_s) for number, time_s in enumerate(times)))
     # a clock that tells nothing withholds all
     assert [bool(reading.withheld) for reading in readings] == [False, False, True, bool(np.isnan(jump_s))]
     assert "the clock of the fake jumped by" in str(readings[2].withheld)
@@ -186,7 +129,7 @@ def test_a_stream_is_read_and_its_end_is_told():
         server = Thread(target=serve)
         server.start()
         source = open_live(f"tcp://127.0.0.1:{listening.getsockname()[1]}")
-        assert isinstance(source, StreamSource)
+        assert isinstance(source, CameraSource)
         with source, pytest.raises(SourceError, match="has ended; start the camera again"):
             images.extend(source.frames())
         server.join()
@@ -199,13 +142,13 @@ def test_a_stream_is_read_and_its_end_is_told():
 
 def test_a_stream_that_is_not_there_is_told(unused_port: int):
     with pytest.raises(SourceError, match=r"the stream tcp://127.0.0.1:\d+ cannot be read .*check its address"):
-        StreamSource(f"tcp://127.0.0.1:{unused_port}").__enter__()
+        open_live(f"tcp://127.0.0.1:{unused_port}").__enter__()
 
 
 def test_a_stream_leads_to_no_file_of_this_machine(tmp_path: Path):
     (tmp_path / "list.m3u8").write_text("#EXTM3U\n")
     with pytest.raises(SourceError):
-        StreamSource(f"file://{tmp_path}/list.m3u8").__enter__()
+        CameraSource(f"file://{tmp_path}/list.m3u8", LiveOptions()).__enter__()
 
 
 # cameras: FFmpeg opens a film in place of the device

@@ -2,90 +2,35 @@
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from threading import Semaphore
-from typing import Any
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from scripted import Scripted, frames_of, plain_reader, source_of
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import sliplens as sl
 from sliplens.errors import ImageError
-from sliplens.live.contract import LiveSource
 from sliplens.live.reading import Check, LiveFrame, MarkerReading, Reading, SlipState
-from sliplens.markers import Tracker, Tracks
-from sliplens.models.checkpoint import Network
+from sliplens.markers import Tracker
 from sliplens.recordings import ContactState, Dataset, Recording
 from sliplens.recordings.source import open_source
 
-plain_reader = partial(sl.LiveReader, health=None, slip=None, stall_s=10.0)
-"""What is captured and read, without judging it, however slow the machine is."""
+
+def watch(read: Callable[[float], MarkerReading]) -> Callable[[np.ndarray], SimpleNamespace]:
+    """Make slip detectors that say of each time what they are given to say."""
+    return lambda _: SimpleNamespace(update=lambda _, time_s: read(time_s))
 
 
-class Burst(LiveSource):
-    """Frames given as fast as they are taken, numbered as told."""
-
-    name, rate_hz = "a burst", 1000.0
-
-    def __init__(self, images: np.ndarray, numbers: list[int], *, wait_s: float = 0.0) -> None:
-        self.images, self.numbers, self.wait_s, self.size = images, numbers, wait_s, images.shape[1:3]
-
-    def frames(self) -> Iterator[LiveFrame]:
-        for number, image in zip(self.numbers, self.images, strict=True):
-            time.sleep(self.wait_s)
-            yield LiveFrame(image=image, number=number, time_s=0.05 * number, captured_s=time.monotonic())
-
-
-class Patient(Burst):
-    """A burst in which each frame waits until the one before it was read."""
-
-    def __init__(self, images: np.ndarray, numbers: list[int] | None = None) -> None:
-        super().__init__(images, list(range(len(images))) if numbers is None else numbers)
-        self.read, self.acted = Semaphore(1), list[Reading]()
-
-    def update_reading(self, reading: Reading) -> None:
-        self.acted.append(reading)
-
-    def frames(self) -> Iterator[LiveFrame]:
-        for frame in super().frames():
-            assert self.read.acquire(timeout=10)
-            yield replace(frame, captured_s=time.monotonic())
-
-    def all_readings(self, reader: sl.LiveReader | Network | Path | str | None, **settings: Any) -> list[Reading]:
-        """Readings of a reader, or of a network without checks but those of the settings."""
-        heard: list[Reading] = []
-
-        def next_one(reading: Reading, _: LiveFrame | None) -> None:
-            heard.append(reading)
-            self.read.release()
-
-        if not isinstance(reader, sl.LiveReader):
-            reader = plain_reader(self, reader, engine="torch", **settings)
-        reader.subscribe(next_one)
-        with reader:
-            list(reader.readings())
-        return heard
-
-
-def watch(read: Callable[[float], MarkerReading]) -> type:
-    """Make a slip detector that says of each time what it is given to say."""
-
-    class Watch:
-        def __init__(self, rest_px: np.ndarray) -> None:
-            self.markers = len(rest_px)
-
-        def update(self, positions_px: np.ndarray, time_s: float) -> MarkerReading:
-            assert len(positions_px) == self.markers
-            return read(time_s)
-
-    return Watch
+def judge(*checks: Callable[[LiveFrame], Check]) -> Callable[[np.ndarray], SimpleNamespace]:
+    """Make monitors whose health is that of some checks."""
+    return lambda _: SimpleNamespace(check=lambda frame, _: tuple(check(frame) for check in checks))
 
 
 @pytest.fixture
@@ -96,7 +41,7 @@ def recording(small_dataset: Dataset) -> Recording:
 def test_a_reading_is_what_predict_says_of_the_frame(recording: Recording, difference_run: Path):
     table = sl.predict(difference_run, recording.frames, reference=recording.reference).to_arrow()
     told = table.column("prediction").to_numpy()
-    readings = Patient(recording.frames).all_readings(difference_run, reference=recording.reference)
+    readings = source_of(recording.frames).all_readings(difference_run, reference=recording.reference)
     assert len(readings) == 12
     for reading in readings:
         assert reading.withheld is None
@@ -104,11 +49,12 @@ def test_a_reading_is_what_predict_says_of_the_frame(recording: Recording, diffe
         assert reading.margin == pytest.approx(np.clip(told[reading.number], 0, 1), abs=1e-4)
 
 
-def test_frames_are_read_in_order_as_predict_reads_them(small_dataset: Dataset, sequence_run: Path):
-    run, info = sl.load(sequence_run), small_dataset.trials[0]
-    recording, [capture] = small_dataset.load(info), open_source(small_dataset, trial=info.trial)
+def test_frames_are_read_in_order_as_predict_reads_them(
+    recording: Recording, small_dataset: Dataset, sequence_run: Path
+):
+    run, [capture] = sl.load(sequence_run), open_source(small_dataset, trial=recording.trial)
     table = sl.predict(run, [replace(capture, frame_time_s=0.05 * np.arange(12))], sequence=True).to_arrow()
-    source = Patient(recording.frames[1:], list(range(1, 12)))  # nothing touches the first, and it is forgotten
+    source = source_of(recording.frames[1:], range(1, 12))  # nothing touches the first, and it is forgotten
     readings = source.all_readings(run, reference=recording.reference, sequence=True)
     assert [reading.number for reading in readings] == list(range(1, 12))
     assert all(reading.sequence for reading in readings)
@@ -121,24 +67,18 @@ def test_frames_are_read_in_order_as_predict_reads_them(small_dataset: Dataset, 
 
 def test_frames_after_a_gap_are_read_by_themselves_and_say_so(recording: Recording, sequence_run: Path):
     numbers = [1, 2, 3, 20, 21, 22]  # 0.85 s were withheld, or lost
-    source = Patient(recording.frames[1:7], numbers)
+    source = source_of(recording.frames[1:7], numbers)
     readings = source.all_readings(sequence_run, reference=recording.reference, sequence=True)
     assert [reading.sequence for reading in readings] == [True] * 3 + [False] * 3
 
 
 @pytest.mark.parametrize("wait_s", [0.0, 0.01])
 def test_every_frame_is_read_or_counted_as_dropped(recording: Recording, wait_s: float):
-    heard: list[Reading] = []
-
-    def slowly(reading: Reading, _: LiveFrame | None) -> None:
-        time.sleep(0.004)
-        heard.append(reading)
-
-    source = Burst(recording.frames, list(range(len(recording.frames))), wait_s=wait_s)
+    frames = [step for frame in frames_of(recording.frames) for step in (lambda _: time.sleep(wait_s), frame)]
+    source = Scripted(*frames, patient=False)
     reader = plain_reader(source, reference=recording.reference)
-    reader.subscribe(slowly)
-    with reader:
-        list(reader.readings())
+    reader.subscribe(lambda *_: time.sleep(0.004))
+    heard = source.all_readings(reader)
     numbers = [reading.number for reading in heard]
     assert numbers == sorted(set(numbers))
     assert numbers[-1] == len(recording.frames) - 1  # the newest is never the one that is dropped
@@ -147,7 +87,7 @@ def test_every_frame_is_read_or_counted_as_dropped(recording: Recording, wait_s:
 
 
 def test_who_asks_late_gets_the_newest_and_is_not_left_waiting(recording: Recording):
-    with plain_reader(Burst(recording.frames[:2], [0, 1]), reference=recording.reference) as reader:
+    with plain_reader(source_of(recording.frames[:2], patient=False), reference=recording.reference) as reader:
         early = reader.readings()
         assert reader._over.wait(timeout=10)
         for readings in early, reader.readings():
@@ -157,7 +97,7 @@ def test_who_asks_late_gets_the_newest_and_is_not_left_waiting(recording: Record
 def test_without_a_reference_the_first_still_picture_is_taken(recording: Recording, rng: np.random.Generator):
     moving = rng.integers(0, 255, (6, 48, 48, 3), dtype=np.uint8)
     still = np.repeat(recording.reference[None] + np.uint8(40), 10, axis=0)
-    source = Patient(np.concatenate([moving, still]))
+    source = source_of(np.concatenate([moving, still]))
     reader = plain_reader(source)
     readings = source.all_readings(reader)
     assert "no reference frame yet" in str(readings[0].withheld)
@@ -167,7 +107,7 @@ def test_without_a_reference_the_first_still_picture_is_taken(recording: Recordi
 
 def test_a_new_reference_is_taken_on_request(recording: Recording):
     light = recording.reference + np.uint8(60)
-    source = Patient(np.repeat(light[None], 30, axis=0))
+    source = source_of(np.repeat(light[None], 30, axis=0))
     reader = plain_reader(source, reference=recording.reference)
 
     def ask(reading: Reading, _: LiveFrame | None) -> None:
@@ -180,33 +120,17 @@ def test_a_new_reference_is_taken_on_request(recording: Recording):
     np.testing.assert_array_equal(reader.reference, light)
 
 
-class Strict:
-    """Health that lets frames pass whose number is even."""
-
-    def __init__(self, reference: np.ndarray) -> None:
-        assert reference.shape == (48, 48, 3)
-
-    def check(self, frame: LiveFrame, _: Tracks | None) -> tuple[Check, ...]:
-        odd = frame.number % 2
-        return (Check(name="even", value=float(odd), limit=0.0, ok=not odd, sentence="odd; wait for the next"),)
-
-
 def test_a_margin_is_withheld_where_a_check_fails(recording: Recording, difference_run: Path):
-    readings = Patient(recording.frames).all_readings(difference_run, reference=recording.reference, health=Strict)
+    def even(frame: LiveFrame) -> Check:
+        odd = frame.number % 2
+        return Check(name="even", value=float(odd), limit=0.0, ok=not odd, sentence="odd; wait for the next")
+
+    settings = {"reference": recording.reference, "health": judge(even)}
+    readings = source_of(recording.frames).all_readings(difference_run, **settings)
     assert {(reading.number % 2 == 1, reading.margin is None, bool(reading.withheld)) for reading in readings} == {
         (False, False, False),
         (True, True, True),
     }
-
-
-class Lenient:
-    """Health that finds nothing wrong with any picture."""
-
-    def __init__(self, reference: np.ndarray) -> None:
-        self.reference = reference
-
-    def check(self, _: LiveFrame, __: Tracks | None) -> tuple[Check, ...]:
-        return ()
 
 
 def test_every_margin_has_the_novelty_of_its_very_frame(trials: dict[str, Recording]):
@@ -219,7 +143,7 @@ def test_every_margin_has_the_novelty_of_its_very_frame(trials: dict[str, Record
     known = sl.predict(network, frames, reference=trial.reference).to_arrow()["known"].to_numpy()
     assert (known[1::2] < 0.01).any()
     assert (known[::2] > 0.01).any()
-    readings = Patient(frames).all_readings(network, reference=trial.reference, health=Lenient)
+    readings = source_of(frames).all_readings(network, reference=trial.reference, health=judge())
     for reading, share in zip(readings, known, strict=True):
         if not all(check.ok for check in reading.health if check.name == "direction"):
             continue  # the network was not run
@@ -230,9 +154,10 @@ def test_every_margin_has_the_novelty_of_its_very_frame(trials: dict[str, Record
 
 
 def test_markers_are_followed_for_whoever_tells_slip(trials: dict[str, Recording]):
-    trial, source = trials["chromatouch"], Patient(trials["chromatouch"].frames[:1])
-    sticks = watch(lambda _: MarkerReading(state=SlipState.STICKING))
-    reader = plain_reader(source, reference=trial.reference, slip=sticks)
+    trial, source = trials["chromatouch"], source_of(trials["chromatouch"].frames[:1])
+    reader = plain_reader(
+        source, reference=trial.reference, slip=watch(lambda _: MarkerReading(state=SlipState.STICKING))
+    )
     assert [reading.slip for reading in source.all_readings(reader)] == [SlipState.STICKING]
     assert trial.truth is not None
     assert reader.markers_px is not None
@@ -246,7 +171,7 @@ def test_without_a_contact_there_is_no_margin(trials: dict[str, Recording], name
     trial = trials["chromatouch"]
 
     touched = watch(lambda time_s: MarkerReading(state=SlipState.CANNOT_TELL, contact=time_s > 0))
-    source, network = Patient(trial.frames[:2]), "chromatouch-difference" if named else None
+    source, network = source_of(trial.frames[:2]), "chromatouch-difference" if named else None
     first, second = source.all_readings(network, reference=trial.reference, slip=touched)
     assert first.contact_state is ContactState.NO_CONTACT
     assert first.margin is None
@@ -263,7 +188,7 @@ def test_what_is_told_of_friction_shapes_the_margin_and_a_slip_narrows_it(
     slips = watch(
         lambda time_s: MarkerReading(state=SlipState.STICKING, contact=True, slipped_s=0.06 if time_s > 0.12 else None)
     )
-    told, source = sl.Friction.between(0.3, 0.9), Patient(trial.frames[10:14])
+    told, source = sl.Friction.between(0.3, 0.9), source_of(trial.frames[10:14])
     readings = source.all_readings(network, reference=trial.reference, friction=told, slip=slips)
     estimates = [network.estimate(network.encode(frame[None], trial.reference)) for frame in trial.frames[10:14]]
     ratios = [one.ratio for one in estimates if one.ratio is not None]
@@ -277,17 +202,12 @@ def test_what_is_told_of_friction_shapes_the_margin_and_a_slip_narrows_it(
         assert reading.margin == pytest.approx(float(again.margin[0]), abs=1e-4)
 
 
-class Grasps:
-    """Markers that tell a grasp, a slip in its fourth frame, and that it is let go in the last of each five."""
-
-    def __init__(self, _: np.ndarray) -> None:
-        self.count = 0
-
-    def update(self, _: np.ndarray, _time_s: float, /) -> MarkerReading:
-        place, self.count = self.count % 5, self.count + 1
-        if place == 4:
-            return MarkerReading(state=SlipState.CANNOT_TELL, contact=False)
-        return MarkerReading(state=SlipState.STICKING, contact=True, slipped_s=0.06 if place == 3 else None)
+def grasp(time_s: float) -> MarkerReading:
+    """A grasp, a slip in its fourth frame, and that it is let go in the last of each five."""
+    place = round(time_s / 0.05) % 5
+    if place == 4:
+        return MarkerReading(state=SlipState.CANNOT_TELL, contact=False)
+    return MarkerReading(state=SlipState.STICKING, contact=True, slipped_s=0.06 if place == 3 else None)
 
 
 @pytest.mark.parametrize("sequence", [False, True])
@@ -297,20 +217,18 @@ def test_a_slip_teaches_the_next_grasp_of_the_same_object_until_there_is_another
 ):
     trial = trials["chromatouch"]
     images = np.tile(trial.frames[10:15], (3, 1, 1, 1))
-    source, friction, kept = Patient(images), list[str | None](), list[bool]()
-    options = {"same_object": same_object, "sequence": sequence, "slip": Grasps, "health": None, "engine": "torch"}
-    reader = sl.LiveReader(source, "chromatouch-difference", reference=trial.reference, stall_s=10.0, **options)
+    options = {"same_object": same_object, "sequence": sequence, "slip": watch(grasp), "engine": "torch"}
+    reader = plain_reader(source := source_of(images), "chromatouch-difference", reference=trial.reference, **options)
 
     def hear(reading: Reading, _: object) -> None:
-        friction.append(reading.friction)
-        kept.append(reading.sequence)
         if reading.number == 9:
             assert reader.learnt is not None
             reader.new_object()
             assert reader.learnt is None
 
     reader.subscribe(hear)
-    source.all_readings(reader)
+    readings = source.all_readings(reader)
+    friction, kept = ([getattr(reading, name) for reading in readings] for name in ("friction", "sequence"))
     first, second, third = friction[:4], friction[5:9], friction[10:14]
     assert set(first) == set(third) == {None}
     assert all("learnt from slips" in str(one) for one in second) if same_object else set(second) == {None}
@@ -328,7 +246,7 @@ def test_by_default_health_and_slip_are_watched_and_no_touch_has_no_margin(trial
     trial = trials["chromatouch"]
     untouched = np.flatnonzero(np.isnan(trial.safety_margin))[:2]
     touched = np.flatnonzero(np.isfinite(trial.safety_margin))[20:22]
-    source = Patient(trial.frames[np.concatenate([untouched, touched])])
+    source = source_of(trial.frames[np.concatenate([untouched, touched])])
     readings = source.all_readings(sl.LiveReader(source, reference=trial.reference, stall_s=10.0))
     assert [reading.contact_state is ContactState.NO_CONTACT for reading in readings] == [True, True, False, False]
     assert "nothing touches the sensor; press it on something" in str(readings[0].withheld)
@@ -339,7 +257,7 @@ def test_by_default_health_and_slip_are_watched_and_no_touch_has_no_margin(trial
 def test_markers_of_a_large_frame_are_told_in_its_own_pixels(trials: dict[str, Recording]):
     trial = trials["chromatouch"]
     large = [np.kron(image, np.ones((2, 2, 1), dtype=np.uint8)) for image in (trial.reference, trial.frames[20])]
-    source = Patient(np.stack([large[1]]))
+    source = source_of(np.stack([large[1]]))
     reader = sl.LiveReader(source, reference=large[0], stall_s=10.0)
     source.all_readings(reader)
     assert reader.markers_px is not None
@@ -363,7 +281,7 @@ def test_readers_that_end_in_any_order_give_the_process_its_threads_back(recordi
         stack.callback(cv2.setNumThreads, cv2_had)
         torch.set_num_threads(2)
         cv2.setNumThreads(2)
-        readers = [plain_reader(Burst(recording.frames[:2], [0, 1])) for _ in range(2)]
+        readers = [plain_reader(source_of(recording.frames[:2], patient=False)) for _ in range(2)]
         for reader in readers:
             reader.__enter__()
         readers[0].__exit__(None, None, None)

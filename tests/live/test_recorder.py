@@ -17,6 +17,8 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from data_sets import contents
+from scripted import frame_of
+from there import there
 
 import sliplens as sl
 from sliplens.errors import RecordingError, SliplensError
@@ -37,25 +39,16 @@ from sliplens.recordings.store import forces_path, load_forces
 FACTS = TrialFacts(trial="cup", sensor="tip", object="a cup", condition="wet", day=3)
 
 
-def frames_of(recording: Recording, *, begin_s: float = 0.0, first: int = 0) -> list[LiveFrame]:
+def frames_of(recording: Recording, *, begin_s: float = 0.0) -> list[LiveFrame]:
     """Frames with their margins and, but for the first, two force samples each."""
-    return [
-        LiveFrame(
-            image=image,
-            number=first + number,
-            time_s=begin_s + 0.1 * number,
-            captured_s=begin_s + 0.1 * number,
-            safety_margin=None if np.isnan(margin) else float(margin),
-            forces=None
-            if number == 0
-            else Forces(
-                time_s=begin_s + 0.1 * number + np.array([-0.05, 0.0]),
-                force_n=np.array([[number, 0.0, 1.0], [number, 0.5, 1.0]]),
-                source="a sensor",
-            ),
-        )
-        for number, (image, margin) in enumerate(zip(recording.frames, recording.safety_margin, strict=True))
-    ]
+    frames = []
+    for number, (image, margin) in enumerate(zip(recording.frames, recording.safety_margin, strict=True)):
+        time_s, force_n = begin_s + 0.1 * number, np.array([[number, 0.0, 1.0], [number, 0.5, 1.0]])
+        forces = Forces(time_s=time_s + np.array([-0.05, 0.0]), force_n=force_n, source="a sensor")
+        frame = frame_of(image, number, time_s=time_s)
+        label = None if np.isnan(margin) else float(margin)
+        frames.append(replace(frame, safety_margin=label, forces=forces if number else None))
+    return frames
 
 
 @pytest.fixture
@@ -83,16 +76,15 @@ def wait_until(condition: Callable[[], object], *, within_s: float = 10.0) -> No
         time.sleep(0.01)
 
 
-def record(folder: Path, frames: list[LiveFrame], recording: Recording) -> Dataset | None:
+def recorder_of(folder: Path, frames: list[LiveFrame], recording: Recording) -> Recorder:
     recorder = Recorder(folder, facts=FACTS, source="a camera")
     for frame in frames:
         recorder.add(frame, recording.reference)
-    return recorder.close()
+    return recorder
 
 
 def test_a_recording_is_what_was_seen(recording: Recording, tmp_path: Path):
-    data = record(tmp_path / "data", frames_of(recording, begin_s=1000.0), recording)
-    assert data is not None
+    data = there(recorder_of(tmp_path / "data", frames_of(recording, begin_s=1000.0), recording).close())
     assert sl.check_dataset(data) == ()
     (info,) = data.trials
     assert replace(FACTS, trial="cup-1") == TrialFacts(**{name: getattr(info, name) for name in vars(FACTS)})
@@ -217,27 +209,23 @@ def test_a_full_disk_stops_the_recording_and_keeps_what_is_there(tmp_path: Path,
     recorder = Recorder(tmp_path / "data")
     with room_for(50_000):
         for number, image in enumerate(images):
-            recorder.add(LiveFrame(image=image, number=number, time_s=float(number), captured_s=0.0), images[0])
-        wait_until(lambda: recorder.outlet.sent + recorder.outlet.lost == 12)
-    state = recorder.outlet
-    assert 0 < state.sent < 8
-    assert state.lost == 12 - state.sent
-    assert f"stopped after {state.sent} were recorded" in str(state.trouble)
-    assert "make room, and record again: what is there stays" in str(state.trouble)
-    data = recorder.close()
-    assert data is not None
+            recorder.add(frame_of(image, number), images[0])
+        wait_until(lambda: recorder.sent + recorder.lost == 12)
+    assert 0 < recorder.sent < 8
+    assert recorder.lost == 12 - recorder.sent
+    assert f"stopped after {recorder.sent} were recorded" in str(recorder.trouble)
+    assert "make room, and record again: what is there stays" in str(recorder.trouble)
+    data = there(recorder.close())
     assert sl.check_dataset(data) == ()
     kept = data.load(data.trials[0]).frames
     # the frame that did not fit may do so once there is room
-    assert state.sent <= len(kept) <= state.sent + 1
+    assert recorder.sent <= len(kept) <= recorder.sent + 1
     np.testing.assert_array_equal(kept, images[: len(kept)])
 
 
 def test_a_disk_that_is_full_at_the_end_keeps_the_journal(recording: Recording, tmp_path: Path):
-    recorder = Recorder(tmp_path / "data")
-    for frame in frames_of(recording):
-        recorder.add(frame, recording.reference)
-    wait_until(lambda: recorder.outlet.sent == 12)
+    recorder = recorder_of(tmp_path / "data", frames_of(recording), recording)
+    wait_until(lambda: recorder.sent == 12)
     with room_for(5_000), pytest.raises(OSError, match="large"):
         recorder.close()
     data = recover_dataset(tmp_path / "data")
@@ -245,16 +233,12 @@ def test_a_disk_that_is_full_at_the_end_keeps_the_journal(recording: Recording, 
 
 
 def test_a_new_reference_a_clock_that_jumps_and_another_size_begin_a_trial(recording: Recording, tmp_path: Path):
-    recorder = Recorder(tmp_path / "data", facts=FACTS)
-    frames = frames_of(recording)
-    for frame in frames:
-        recorder.add(frame, recording.reference)
+    recorder = recorder_of(tmp_path / "data", frames := frames_of(recording), recording)
     other = recording.reference + np.uint8(1)
     for frame in [*frames_of(recording, begin_s=50.0), *frames[:3]]:  # the clock begins anew
         recorder.add(frame, other)
-    recorder.add(LiveFrame(image=np.zeros((24, 24, 3), dtype=np.uint8), number=9, time_s=99.0, captured_s=0.0), other)
-    data = recorder.close()
-    assert data is not None
+    recorder.add(frame_of(np.zeros((24, 24, 3), dtype=np.uint8), 9, time_s=99.0), other)
+    data = there(recorder.close())
     assert [(info.trial, info.frames) for info in data.trials] == [
         ("cup-1", 12), ("cup-2", 12), ("cup-3", 3), ("cup-4", 1),
     ]  # fmt: skip
@@ -288,8 +272,7 @@ def test_a_reader_records_every_frame_whether_it_was_read_or_not(recording: Reco
         reader.record(tmp_path / "other")
     with reader:
         list(reader.readings())
-        data = reader.stop_recording()
-    assert data is not None
+        data = there(reader.stop_recording())
     assert [info.frames for info in data.trials] == [12]
     assert sl.check_dataset(data) == ()
 
@@ -297,16 +280,11 @@ def test_a_reader_records_every_frame_whether_it_was_read_or_not(recording: Reco
 # force samples that another program writes
 
 
-def frame_at(time_s: float, captured_s: float) -> LiveFrame:
-    return LiveFrame(image=np.zeros((2, 2, 3), dtype=np.uint8), number=0, time_s=time_s, captured_s=captured_s)
-
-
-def samples_of(stream: ForceStream, count: int, *, time_s: float, captured_s: float) -> Forces:
+def samples_of(stream: ForceStream, count: int, *, time_s: float = 0.0, captured_s: float = 0.0) -> Forces | None:
     """Wait for so many samples, and bring them to the clock of a frame."""
     wait_until(lambda: len(stream._samples) >= count or stream.trouble)
-    forces = stream.attach(frame_at(time_s, captured_s)).forces
-    assert forces is not None
-    return forces
+    frame = frame_of(np.zeros((2, 2, 3), dtype=np.uint8), 0, time_s=time_s)
+    return stream.attach(replace(frame, captured_s=captured_s)).forces
 
 
 @contextmanager
@@ -327,7 +305,7 @@ def test_samples_keep_their_steps_on_the_clock_of_the_frames(tmp_path: Path):
         file.write("00\n")
         file.flush()
         # a frame that was captured just now is at 100 s on the source's clock
-        forces = samples_of(stream, 3, time_s=100.0, captured_s=begun_s)
+        forces = there(samples_of(stream, 3, time_s=100.0, captured_s=begun_s))
     np.testing.assert_allclose(forces.force_n, [[0, 0, 1.5], [0.25, 0, 1.5], [0.5, 0, 1.5]])
     np.testing.assert_allclose(np.diff(forces.time_s), [0.01, 0.02], atol=1e-9)
     # it arrived after the frame, by now
@@ -338,7 +316,7 @@ def test_samples_without_times_count_from_when_they_arrive(tmp_path: Path):
     with streamed(tmp_path / "forces.csv", "fn,ft\n") as (stream, file):
         begun_s = time.monotonic()
         file.write("2.0,0.5\n")
-        forces = samples_of(stream, 1, time_s=begun_s, captured_s=begun_s)
+        forces = there(samples_of(stream, 1, time_s=begun_s, captured_s=begun_s))
     np.testing.assert_array_equal(forces.force_n, [[0.5, 0.0, 2.0]])
     assert begun_s <= forces.time_s[0] <= time.monotonic()
 
@@ -346,12 +324,10 @@ def test_samples_without_times_count_from_when_they_arrive(tmp_path: Path):
 def test_samples_that_drop_out_or_come_late_are_left_out(tmp_path: Path):
     with streamed(tmp_path / "forces.csv", "time_s,fx,fy,fz\n") as (stream, file):
         file.write("1.0,0,0,1\n1.2,nan,0,1\n1.4,0,0,3\n1.1,0,0,9\n1.3,0,0,9\n1.5,0,0,4\n")
-        forces = samples_of(stream, 6, time_s=0.0, captured_s=0.0)
+        forces = there(samples_of(stream, 6))
         np.testing.assert_array_equal(forces.force_n[:, 2], [1, 3, 4])
         file.write("2.0,nan,nan,nan\n")
-        file.flush()
-        wait_until(lambda: stream._samples)
-        assert stream.attach(frame_at(0.0, 0.0)).forces is None
+        assert samples_of(stream, 1) is None
 
 
 def test_a_named_pipe_is_read_too(tmp_path: Path):
@@ -360,7 +336,7 @@ def test_a_named_pipe_is_read_too(tmp_path: Path):
     with ForceStream(path) as stream, path.open("w") as file:
         file.write("time_s,fx,fy,fz\n1.0,0,0,1\n1.5,0,0,2\n")
         file.flush()
-        forces = samples_of(stream, 2, time_s=0.0, captured_s=0.0)
+        forces = there(samples_of(stream, 2))
     np.testing.assert_array_equal(forces.force_n[:, 2], [1, 2])
 
 

@@ -4,13 +4,15 @@ import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from data_sets import save_dataset
+from made_up import explained
+from rrd import read_rrd, shown
 from there import there
 
 import sliplens as sl
@@ -21,59 +23,14 @@ from sliplens.recordings import Recording
 from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
-rerun = pytest.importorskip("rerun")
-chunk = pytest.importorskip("rerun.chunk")
+pytest.importorskip("rerun")
 
 FRAMES = 20  # more than are sent together, and no multiple of them
 
 
-class Rows(NamedTuple):
-    """What a file says of one component of one entity, in the order of time."""
-
-    time_ns: np.ndarray | None
-    frame: np.ndarray | None
-    values: list[Any]
-
-
-Read = Callable[[str, str], Rows]
-
-
-def read_rrd(path: Path) -> dict[str, list[pa.RecordBatch]]:
-    """Chunks of the one recording of a file, by entity."""
-    reader, found = chunk.RrdReader(path), {}
-    assert [entry.application_id for entry in reader.recordings()] == ["sliplens"]
-    for one in reader.stream():
-        found.setdefault(one.entity_path.removeprefix("/"), []).append(one.to_record_batch())
-    return found
-
-
-def rows(entities: dict[str, list[pa.RecordBatch]], entity: str, component: str) -> Rows:
-    batches = [batch for batch in entities[entity] if component in batch.schema.names]
-    table = pa.concat_tables([pa.Table.from_batches([batch]) for batch in batches], promote_options="permissive")
-    time, frame = (table.column(name).to_numpy() if name in table.column_names else None for name in ("time", "frame"))
-    values = table.column(component).to_pylist()
-    if time is None:
-        return Rows(None, None, values)
-    order = np.argsort(time.astype(np.int64), kind="stable")
-    return Rows(
-        time.astype(np.int64)[order],
-        None if frame is None else frame[order],
-        [values[at] for at in order],
-    )
-
-
-def shown(entities: dict[str, list[pa.RecordBatch]], entity: str, component: str) -> tuple[list[int], list[Any]]:
-    """Frames with a value of a component, and these values."""
-    if not any(component in batch.schema.names for batch in entities[entity]):
-        return [], []
-    found = rows(entities, entity, component)
-    frames = zip(there(found.frame).tolist(), found.values, strict=True)
-    return [at for at, value in frames if value is not None], [value for value in found.values if value is not None]
-
-
 def pictures(entities: dict[str, list[pa.RecordBatch]], entity: str) -> np.ndarray:
-    found = rows(entities, entity, "EncodedImage:blob")
-    return np.stack([read_image(bytes(blob), where=entity) for (blob,) in found.values])
+    _, blobs = shown(entities, entity, "EncodedImage:blob")
+    return np.stack([read_image(bytes(blob), where=entity) for (blob,) in blobs])
 
 
 @pytest.fixture(scope="module")
@@ -82,28 +39,18 @@ def trial() -> Recording:
     return simulate_trial(replace(plan_trials(PRESETS["small"])[0], frames=FRAMES))
 
 
-@pytest.fixture(scope="module")
-def written(trial: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("simulated")
-    data = save_dataset(folder / "data", trial)
-    told = []
-    sl.view(data.folder, out=folder / "new" / "a.rrd", on_progress=lambda done, total: told.append((done, total)))
+def test_frames_and_margins_come_back_as_they_are(trial: Recording, tmp_path: Path):
+    data, told = save_dataset(tmp_path / "data", trial), []
+    path = tmp_path / "new" / "a.rrd"
+    sl.view(data.folder, out=path, on_progress=lambda done, total: told.append((done, total)))
     assert told == [(done, FRAMES) for done in range(1, FRAMES + 1)]
-    assert [path.name for path in (folder / "new").iterdir()] == ["a.rrd"]
-    return folder / "new" / "a.rrd"
-
-
-@pytest.fixture(scope="module")
-def simulated(written: Path) -> dict[str, list[pa.RecordBatch]]:
-    return read_rrd(written)
-
-
-def test_frames_and_margins_come_back_as_they_are(trial: Recording, simulated: dict[str, list[pa.RecordBatch]]):
+    assert list(path.parent.iterdir()) == [path]
+    simulated = read_rrd(path)
     np.testing.assert_array_equal(pictures(simulated, "frame"), trial.frames)
     frames, margins = shown(simulated, "true", "Scalars:scalars")
     assert frames == np.flatnonzero(np.isfinite(trial.safety_margin)).tolist()  # before the contact there is none
     np.testing.assert_array_equal(np.ravel(margins), trial.safety_margin[frames])
-    times_ns = there(rows(simulated, "frame", "EncodedImage:blob").time_ns)
+    times_ns, _ = shown(simulated, "frame", "EncodedImage:blob", "time")
     np.testing.assert_array_equal(times_ns, np.round(1e9 * trial.time_s).astype(np.int64))
 
 
@@ -174,37 +121,16 @@ def test_frames_of_any_source_and_explained_ones_are_viewed_alike(trial: Recordi
 
 def explained_of(trial: Recording, frames: list[int]) -> Explanation:
     """Maps of some frames of a trial, drawn by chance."""
-    relevance = np.random.default_rng(1).normal(0, 1, (len(frames), 224, 224)).astype(np.float32)
     labels = [float(margin) if np.isfinite(margin) else None for margin in trial.safety_margin[frames]]
-    return Explanation(
-        input="difference",
-        source="simulated",
-        weights_sha256="",
-        frames=tuple(
-            ExplainedFrame(
-                id=f"{trial.trial}-f{at:04d}",
-                trial=trial.trial,
-                condition=trial.condition,
-                safety_margin=label,
-                prediction=0.5,
-                reference_prediction=1.0,
-            )
-            for at, label in zip(frames, labels, strict=True)
-        ),
-        methods={"poly-cam": MethodNotes(seconds_per_frame=0.1, warnings=())},
-        images=trial.frames[frames].transpose(0, 3, 1, 2),
-        references=trial.frames[frames].transpose(0, 3, 1, 2),
-        pictures=trial.frames[frames],
-        relevance={"poly-cam": relevance},
+    facts = {"trial": trial.trial, "condition": trial.condition, "prediction": 0.5, "reference_prediction": 1.0}
+    rows = tuple(
+        ExplainedFrame(id=f"{trial.trial}-f{at:04d}", safety_margin=label, **facts)
+        for at, label in zip(frames, labels, strict=True)
     )
+    saliency = {"poly-cam": np.random.default_rng(1).random((len(frames), 224, 224), dtype=np.float32)}
+    methods = {"poly-cam": MethodNotes(seconds_per_frame=0.1, warnings=())}
+    return explained("difference", rows, methods, trial.frames[frames], saliency)
 
-
-class Begun(NamedTuple):
-    command: list[str]
-    process: subprocess.Popen[bytes]
-
-
-StandIn = Callable[[str], list[Begun]]
 
 STAND_IN = """
 import socket, sys, time
@@ -215,18 +141,17 @@ time.sleep(60)
 
 
 @pytest.fixture
-def stand_in(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> StandIn:
+def stand_in(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[str], list[subprocess.Popen[bytes]]]:
     """Start a script in the viewer's place; gives the processes that were started."""
 
-    def put(code: str) -> list[Begun]:
+    def put(code: str) -> list[subprocess.Popen[bytes]]:
         script, begun = tmp_path / "viewer.py", []
         script.write_text(code)
 
         def popen(command: list[str], **settings: Any) -> subprocess.Popen[bytes]:
             assert command[1:3] == ["-m", "rerun_cli"]
-            process: subprocess.Popen[bytes] = real([command[0], str(script), *command[3:]], **settings)
-            begun.append(Begun(command, process))
-            return process
+            begun.append(real([command[0], str(script), *command[3:]], **settings))
+            return begun[-1]
 
         monkeypatch.setattr(viewer_process.subprocess, "Popen", popen)
         return begun
@@ -235,18 +160,18 @@ def stand_in(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> StandIn:
     return put
 
 
-def test_the_viewer_listens_to_this_machine_alone(stand_in: StandIn):
+def test_the_viewer_listens_to_this_machine_alone(stand_in: Callable[[str], list[Any]]):
     begun = stand_in(STAND_IN)
     address = viewer_process.start_viewer()
-    words, process = begun[0]
+    [process] = begun
     assert process.poll() is None
     process.kill()
     process.wait()
-    assert words[words.index("--bind") + 1] == "127.0.0.1"
-    assert address == f"rerun+http://127.0.0.1:{words[words.index('--port') + 1]}/proxy"
+    assert process.args[process.args.index("--bind") + 1] == "127.0.0.1"
+    assert address == f"rerun+http://127.0.0.1:{process.args[process.args.index('--port') + 1]}/proxy"
 
 
-def test_a_viewer_that_finds_no_screen_is_told_with_its_reason(stand_in: StandIn):
+def test_a_viewer_that_finds_no_screen_is_told_with_its_reason(stand_in: Callable[[str], list[Any]]):
     # it listens first, and only then looks for a screen
     stand_in(STAND_IN.replace("time.sleep(60)", "time.sleep(0.3); sys.exit('Error: no DISPLAY is set')"))
     with pytest.raises(InputError, match=r"did not start \(Error: no DISPLAY is set\); write a file with --output"):

@@ -1,6 +1,6 @@
 // Number, picture, chart and lamps of a running sensor, drawn from messages of a binary websocket.
 //
-// A message is JSON (client.py, `_message`), with a JPEG and the cells of a map in base 64 where they are new. The first
+// A message is JSON (feed.py, `_message`), with a JPEG and the cells of a map in base 64 where they are new. The first
 // one holds the settings. What was drawn is answered by its serial number; who does not answer is sent no more than two
 // messages, so that nobody waits for a slow or hidden window.
 
@@ -91,7 +91,7 @@ function begin(told) {
 }
 
 function show() {
-  send({ act: "show", map: $.map.checked, markers: $.arrows.checked });
+  send({ act: "show", map: $.map.checked });
 }
 
 function paintMap({ rows, columns }, cells) {
@@ -149,7 +149,7 @@ function drawPicture() {
     context.drawImage(map, 0, 0, canvas.width, canvas.height);
   }
   context.setTransform(scale, 0, 0, scale, 0, 0);
-  drawArrows(context, arrows, devicePixelRatio / scale);
+  if ($.arrows.checked) drawArrows(context, arrows, devicePixelRatio / scale);
 }
 
 function drawArrows(context, arrows, px) {
@@ -505,7 +505,8 @@ document.addEventListener("keydown", ({ key, target, repeat, ctrlKey, altKey, me
   if (name && !repeat && !ctrlKey && !altKey && !metaKey && !target.matches("select")) act(name);
 });
 document.addEventListener("input", ({ target }) => target.type === "range" && move(target));
-$.map.onchange = $.arrows.onchange = show;
+$.map.onchange = show;
+$.arrows.onchange = redraw;
 $.wet.onchange = $.controller.onchange = () => send({ act: "hold", wet: $.wet.checked, controller: $.controller.value });
 const sizes = new ResizeObserver(redraw);
 [$.picture, $.chart].forEach((canvas) => sizes.observe(canvas));

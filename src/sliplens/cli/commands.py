@@ -157,8 +157,8 @@ def call_live(
                 say(f"open {served.address}", aside=True)
             log = _Log()
             for reading in filter(lambda _: log.due(), reader.readings()):
-                for sender in () if page else reader.senders:
-                    if sender.error:
+                for sender in () if page else reader.outputs:
+                    if sender.error and sender is not reader.recorder:
                         raise sender.error
                 log.warn((*reader.doubts, *reader.troubles))
                 if not sink:

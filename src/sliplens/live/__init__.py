@@ -12,7 +12,6 @@ from sliplens.live.sources import (
     CameraSource,
     ReplaySource,
     SimulatedSource,
-    StreamSource,
     list_cameras,
     open_live,
 )
@@ -21,5 +20,5 @@ __all__ = [
     "SOURCES", "CameraSource", "Check", "ForceStream", "HealthMonitor",
     "Latency", "LiveFrame", "LiveOptions", "LiveReader", "LiveSource", "MarkerReading", "Outlet", "Reading",
     "Recorder", "ReplaySource", "SimulatedSource", "SlipDetector", "SlipState", "SourceKind",
-    "StreamSource", "list_cameras", "open_live", "read_live",
+    "list_cameras", "open_live", "read_live",
 ]  # fmt: skip

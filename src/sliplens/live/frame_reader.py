@@ -15,7 +15,7 @@ from sliplens.friction import FrictionLike, SlipLearner, as_friction
 from sliplens.images import require_rgb, soften
 from sliplens.live.contract import LiveOptions, LiveSource
 from sliplens.live.health import HealthMonitor, check_direction, check_novelty, margin_risk
-from sliplens.live.reading import OFF, Check, Latency, LiveFrame, Reading, small_factor, small_picture
+from sliplens.live.reading import OFF, Latency, LiveFrame, Reading, small_factor, small_picture
 from sliplens.live.slip import SlipDetector
 from sliplens.markers import Tracker
 from sliplens.models.checkpoint import Network
@@ -177,8 +177,8 @@ class FrameReader:
     def missing(self, why: str) -> Reading:
         """Make the reading of a moment without a frame."""
         last = self._last or Reading(number=-1, time_s=np.nan, captured_s=np.nan)
-        parts = {"number": last.number, "time_s": last.time_s, "captured_s": last.captured_s}
-        return Reading(**parts, withheld=why, dropped=self._dropped)
+        begin = Reading(number=last.number, time_s=last.time_s, captured_s=last.captured_s)
+        return replace(begin, withheld=why, dropped=self._dropped)
 
     def read(self, frame: LiveFrame) -> Reading:
         """Read the next frame."""
@@ -194,7 +194,9 @@ class FrameReader:
             latency=Latency(decode_ms=frame.decode_ms),
         )
         why = self._unready(last, frame)
-        self._last = _timed(self._read(begin, frame) if why is None else replace(begin, withheld=why))
+        reading = self._read(begin, frame) if why is None else replace(begin, withheld=why)
+        total_ms = 1e3 * (time.monotonic() - frame.captured_s)
+        self._last = replace(reading, latency=replace(reading.latency, total_ms=total_ms))
         return self._last
 
     def _read(self, begin: Reading, frame: LiveFrame) -> Reading:
@@ -248,7 +250,8 @@ class FrameReader:
         if self._shear is not None and self.network is not None and all(check.ok for check in health):
             health = (*health, check_direction(self.network, self._shear.estimate(frame.image)))
         latency = replace(begin.latency, checks_ms=1e3 * (time.perf_counter() - begun))
-        withheld, slip = _first_fault(health), markers and markers.state
+        withheld = next((check.sentence for check in health if not check.ok), None)
+        slip = markers and markers.state
         reading = replace(begin, slip=slip, markers=markers, health=health, withheld=withheld, latency=latency)
         untouched = any(check.name == "touch" and not check.ok for check in health)
         touches = not untouched and (markers is None or markers.contact is not False)
@@ -329,12 +332,3 @@ class FrameReader:
 
 def _in_pixels(size: tuple[int, ...]) -> str:
     return f"{size[0]} x {size[1]}"
-
-
-def _first_fault(health: tuple[Check, ...]) -> str | None:
-    return next((check.sentence for check in health if not check.ok), None)
-
-
-def _timed(reading: Reading) -> Reading:
-    total_ms = 1e3 * (time.monotonic() - reading.captured_s)
-    return replace(reading, latency=replace(reading.latency, total_ms=total_ms))

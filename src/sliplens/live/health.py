@@ -13,7 +13,7 @@ from sliplens.live.reading import Check, LiveFrame, small_picture
 from sliplens.markers import MarkerStatus, Tracks
 from sliplens.markers.camera import CAMERA_CURE, CAMERA_LIMIT_PX, CameraWatch, block_means
 from sliplens.models.checkpoint import STRANGE, Estimate, Network
-from sliplens.recordings.capture import Forces, Frame
+from sliplens.recordings.capture import Frame
 from sliplens.shear import DIRECTION_LIMIT, Shear
 
 Plane = Float32[np.ndarray, "height width"]
@@ -60,9 +60,15 @@ class HealthMonitor:
     def __init__(self, reference: Frame) -> None:
         small = small_picture(reference)
         self._soft, self._sharpness, self._saturated = soften(small), _sharpness(_green(small)), _saturated_share(small)
-        self._camera, self._stillness = CameraWatch(small), _Stillness()
+        self._camera = CameraWatch(small)
         self._before: np.ndarray | None = None
         self._changed_s = 0.0
+        self._plane: Plane | None = None
+        self._half_planes: list[Plane] = []
+        """Picture at the last change of the upper half, and of the lower one."""
+        self._force_n: np.ndarray | None = None
+        self._changed_force_n: np.ndarray | None = None
+        """Force at the last change of either half."""
         self._numbers: deque[tuple[float, int]] = deque()
         self._last: dict[str, tuple[float, Check]] = {}
         """Time and result of each check when it was made last."""
@@ -78,10 +84,8 @@ class HealthMonitor:
         both = (self._soft > _DIM) & (soft > _DIM) & (self._soft < _WHITE) & (soft < _WHITE)
         ratio = np.log2(np.where(both, soft, 1) / np.where(both, self._soft, 1))
         self._gain = float(np.median(ratio[both])) if both.any() else 0.0
-        # those that cannot be compared sort behind all others
-        self._brighter = np.where(both, ratio - self._gain, np.inf)
+        self._brighter = np.where(both, ratio - self._gain, np.nan)
         self._change = picture_change(soft * 2**-self._gain, self._soft)
-        self._stillness.update(block_means(_green(frame.small), _BLOCK_PX), frame.forces)
         slow = _SLOW if markers is None else _SLOW[:2]  # markers show the camera's motion at once, the border slowly
         age_s = {name: frame.time_s - self._last[name][0] if name in self._last else np.inf for name in slow}
         # too old ones are due, else the oldest; at the same time it may be another frame, of a source without a clock
@@ -99,6 +103,32 @@ class HealthMonitor:
         if self._before is None or not np.array_equal(frame.small, self._before):
             self._before, self._changed_s = frame.small.copy(), frame.time_s
         return max(0.0, frame.time_s - self._changed_s)  # a camera's noise never repeats
+
+    def _halves(self, frame: LiveFrame) -> Measured:
+        """Measure how many times as much one half has changed as the other since its last change, noise taken off.
+
+        A half has changed once its mean square difference is above 1.5 times that from frame to frame, its noise; until
+        then it is compared with the picture of its last change.
+        """
+        plane, ratio, changed = block_means(_green(frame.small), _BLOCK_PX), 0.0, self._changed_force_n is None
+        noise = np.zeros(2) if self._plane is None else _half_squares(plane - self._plane)
+        self._half_planes = self._half_planes or [plane, plane]
+        for half in (0, 1):
+            squares = _half_squares(plane - self._half_planes[half])
+            excess = np.maximum(squares - noise, 0)
+            floor = _NOISE_SHARE * noise[half] + _LEAST_SQUARE
+            ratio = max(ratio, float(np.sqrt(excess[1 - half] / (excess[half] + floor))))
+            if squares[half] > _CHANGED_SHARE * noise[half] + _LEAST_SQUARE:
+                self._half_planes[half], changed = plane, True
+        self._plane = plane
+        self._force_n = self._force_n if frame.forces is None else frame.forces.force_n.mean(axis=0)
+        self._changed_force_n = self._force_n if changed else self._changed_force_n
+        return ratio
+
+    def _force_change(self, _: LiveFrame) -> Measured:
+        if self._force_n is None or self._changed_force_n is None:
+            return None
+        return float(np.linalg.norm(self._force_n - self._changed_force_n))
 
     def _drops(self, frame: LiveFrame) -> Measured:
         numbers = self._numbers
@@ -134,15 +164,12 @@ class HealthMonitor:
         height, width = (side // _TILES for side in self._brighter.shape[:2])
         tiles = self._brighter[: _TILES * height, : _TILES * width]
         tiles = tiles.reshape(_TILES, height, _TILES, width, 3).transpose(0, 2, 4, 1, 3)
-        values = np.sort(tiles.reshape(_TILES, _TILES, 3, -1), axis=-1)
         # inside the border, contact may brighten or shade
         border = np.pad(np.zeros((_TILES - 2, _TILES - 2), dtype=bool), 1, constant_values=True)
-        values = values[border].reshape(-1, height * width)
-        count = np.isfinite(values).sum(axis=1)
-        values, count = values[count > 3], count[count > 3]
+        values = tiles[border].reshape(-1, height * width)
+        values = values[np.isfinite(values).sum(axis=1) > 3]
         # the median: markers that moved are few
-        middle = [np.take_along_axis(values, at[:, None], axis=1) for at in ((count - 1) // 2, count // 2)]
-        worst = float(np.abs(np.add(*middle) / 2).max(initial=0.0))
+        worst = float(np.abs(np.nanmedian(values, axis=1)).max(initial=0.0))
         return worst, f"one side of the picture is {2**worst:.2g} times brighter or darker than in the reference"
 
     def _absent_markers(self, _: LiveFrame) -> Measured:
@@ -159,11 +186,11 @@ class HealthMonitor:
 def make_check(name: str, value: float, sentence: str | None = None, *, cure: str | None = None) -> Check:
     """Compare a value with its limit in `CHECKS`; a check that fails states its cure."""
     kind = CHECKS[name]
-    limit = kind.limit
-    ok = value >= limit if kind.is_minimum else value <= limit
-    cure = kind.cure if cure is None else cure
+    ok = value >= kind.limit if kind.is_minimum else value <= kind.limit
     sentence = kind.sentence.format(value) if sentence is None else sentence
-    return Check(name=name, value=value, limit=limit, ok=ok, sentence=sentence if ok else f"{sentence}; {cure}")
+    if not ok:
+        sentence += f"; {kind.cure if cure is None else cure}"
+    return Check(name=name, value=value, limit=kind.limit, ok=ok, sentence=sentence)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,11 +218,11 @@ CHECKS = {
         sentence="the picture has not changed by a single pixel for {:.2g} s",
     ),
     "halves": CheckKind(
-        measure=lambda health, _: health._stillness.ratio, limit=4.0, unit="ratio", cure=_RESTART, harm=(0.15, 0.02),
+        measure=HealthMonitor._halves, limit=4.0, unit="ratio", cure=_RESTART, harm=(0.15, 0.02),
         sentence="one half of the picture changes {:.2g} times as much as the other",
     ),
     "frozen": CheckKind(
-        measure=lambda health, _: health._stillness.force_change_n, limit=0.15, unit="N", cure=_RESTART,
+        measure=HealthMonitor._force_change, limit=0.15, unit="N", cure=_RESTART,
         harm=(0.91, 0.56), sentence="the force changed by {:.2g} N while the picture showed nothing but noise",
     ),
     "late": CheckKind(
@@ -251,45 +278,6 @@ time are chosen by hand. `harm` was fitted by `benchmarks/health.py --choose --t
 show no touch, whose growth is of an earlier fit to twice as many trials.
 """
 _SLOW = "focus", "light", "camera"
-
-
-class _Stillness:
-    """Changes of the two halves of the picture, upper and lower, against their noise.
-
-    A half has changed once its mean square difference is above 1.5 times that from frame to frame, its noise; until
-    then it is compared with the picture of its last change.
-    """
-
-    def __init__(self) -> None:
-        self.ratio = 0.0
-        """How many times as much one half has changed as the other since that last changed, noise taken off."""
-        self.force_change_n: float | None = None
-        """Change of the force since either half changed; None before any force."""
-        self._before: Plane | None = None
-        self._last: list[Plane] = []
-        self._force_n: np.ndarray | None = None
-        self._last_force_n: np.ndarray | None = None
-
-    def update(self, plane: Plane, forces: Forces | None) -> None:
-        """Take the next frame in means of blocks, and the samples of the force since the one before."""
-        if forces is not None:
-            self._force_n = forces.force_n.mean(axis=0)
-        if self._before is None:
-            self._before, self._last = plane, [plane, plane]
-        noise = _half_squares(plane - self._before)
-        self.ratio, changed = 0.0, False
-        for half in (0, 1):
-            squares = _half_squares(plane - self._last[half])
-            excess = np.maximum(squares - noise, 0)
-            floor = _NOISE_SHARE * noise[half] + _LEAST_SQUARE
-            self.ratio = max(self.ratio, float(np.sqrt(excess[1 - half] / (excess[half] + floor))))
-            if squares[half] > _CHANGED_SHARE * noise[half] + _LEAST_SQUARE:
-                self._last[half], changed = plane, True
-        if changed or self._last_force_n is None:
-            self._last_force_n = self._force_n
-        if self._force_n is not None and self._last_force_n is not None:
-            self.force_change_n = float(np.linalg.norm(self._force_n - self._last_force_n))
-        self._before = plane
 
 
 def _half_squares(plane: Plane) -> Float[np.ndarray, " 2"]:

@@ -4,7 +4,7 @@ import gc
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from threading import Condition, Event, Lock, Thread
@@ -43,41 +43,39 @@ _SWITCH_S = 5e-4
 _FLUSH_S = 5.0
 
 
-_lock, _entered = Lock(), list["LiveReader"]()
-_limits = ExitStack()
-"""Thread limits of the process while a reader is entered; the last one that leaves undoes them."""
+_lock, _entered, _limits = Lock(), list[object](), ExitStack()
 
 
-def _limit_threads(reader: "LiveReader") -> None:
-    """Limit the threads of the whole process while any reader is entered.
+@contextmanager
+def _few_threads() -> Iterator[None]:
+    """Limit the threads of the whole process while any reader is entered; the last one that leaves undoes it.
 
     Threads that share one step wait for each other: a matrix of markers takes ten times as long by two as by one.
     """
     with _lock:
-        _entered.append(reader)
-        if len(_entered) > 1:
-            return
-        restore, threads = _limits.callback, torch.get_num_threads()
-        restore(threadpool_limits(1, user_api="blas").restore_original_limits)
-        restore(torch.set_num_threads, threads)
-        torch.set_num_threads(max(1, threads - 1))  # the checks have a core
-        # a thread that has waited for a core waits for Python too, and the usual 5 ms are a third of a frame
-        restore(sys.setswitchinterval, sys.getswitchinterval())
-        sys.setswitchinterval(_SWITCH_S)
-        # existing objects stay: to search all of them for garbage takes as long as half a frame
-        restore(gc.unfreeze)
-        gc.freeze()
-        if not missing_packages("cv2", extra="markers"):
-            cv2 = import_cv2()
-            restore(cv2.setNumThreads, cv2.getNumThreads())
-            cv2.setNumThreads(1)
-
-
-def _free_threads(reader: "LiveReader") -> None:
-    with _lock:
-        _entered.remove(reader)
-        if not _entered:
-            _limits.close()
+        _entered.append(None)
+        if len(_entered) == 1:
+            restore, threads = _limits.callback, torch.get_num_threads()
+            restore(threadpool_limits(1, user_api="blas").restore_original_limits)
+            restore(torch.set_num_threads, threads)
+            torch.set_num_threads(max(1, threads - 1))  # the checks have a core
+            # a thread that has waited for a core waits for Python too, and the usual 5 ms are a third of a frame
+            restore(sys.setswitchinterval, sys.getswitchinterval())
+            sys.setswitchinterval(_SWITCH_S)
+            # existing objects stay: to search all of them for garbage takes as long as half a frame
+            restore(gc.unfreeze)
+            gc.freeze()
+            if not missing_packages("cv2", extra="markers"):
+                cv2 = import_cv2()
+                restore(cv2.setNumThreads, cv2.getNumThreads())
+                cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        with _lock:
+            _entered.pop()
+            if not _entered:
+                _limits.close()
 
 
 LiveInput: TypeAlias = "str | Path | Images | Capture | LiveSource"
@@ -145,28 +143,20 @@ class LiveReader(FrameReader):
         untouched = read_image(Path(reference)) if isinstance(reference, Path | str) else reference
         self.recorder: Recorder | None = None
         """Recorder, while it records."""
-        self.senders: list[Sender] = []
-        """Senders of readings to other programs."""
-        self._last_recorder: Recorder | None = None
+        self.outputs: tuple[Outlet, ...] = ()
+        """Newest recording, and each sink, with what they have sent."""
         self._untouched, self._profile = untouched, profile
         self._engine_name, self._stall_s = settings.get("engine", "auto"), settings.get("stall_s", 1.0)
         self._forces = None if forces is None else ForceStream(forces)
         self._frames: Mailbox[LiveFrame] = Mailbox()
         self._news = Condition()
         self._newest: Reading | None = None
-        self._published = 0
         self._subscribers: dict[Subscriber, None] = {}
         self._stopped, self._over = Event(), Event()
         self._error: BaseException | None = None
         self._trouble: str | None = None
         self._threads: list[Thread] = []
         self._stack = ExitStack()
-
-    @property
-    def outputs(self) -> "tuple[Outlet, ...]":
-        """Newest recording, and each sink, with what they have sent."""
-        recorder = self._last_recorder
-        return (*(() if recorder is None else (recorder.outlet,)), *self.senders)
 
     @property
     def doubts(self) -> tuple[str, ...]:
@@ -208,8 +198,7 @@ class LiveReader(FrameReader):
         if self._threads:
             raise InputError("a reader reads once; make another one of the same source")
         with ExitStack() as stack:
-            stack.callback(_free_threads, self)
-            _limit_threads(self)
+            stack.enter_context(_few_threads())
             stack.callback(self._end_outputs)
             stack.enter_context(self.source)
             if self._forces is not None:
@@ -227,7 +216,7 @@ class LiveReader(FrameReader):
                 engine = make_engine(self._engine_name, self.network, frames=frames, batch_size=1, streams=1)
             self.begin(engine, untouched, size=size)
             self._stack = stack.pop_all()
-        jobs = (self._capture, self._frames.close), (self._infer, self._finish)
+        jobs = (self._capture, self._frames.shut), (self._infer, self._finish)
         self._threads = [Thread(target=self._run, args=job, daemon=True) for job in jobs]
         for thread in self._threads:
             thread.start()
@@ -258,14 +247,14 @@ class LiveReader(FrameReader):
         """
         if not self._threads:
             raise InputError("nothing is read yet; enter the reader first, with `with reader:`")
-        count = max(0, self._published - 1)  # the newest reading counts as news
+        reading = None
         while True:
             with self._news:
-                while self._published == count and not self._over.is_set():
+                while self._newest is reading and not self._over.is_set():
                     self._news.wait()
-                if self._published == count:
+                if self._newest is reading:
                     break
-                count, reading = self._published, self._newest
+                reading = self._newest
             assert reading is not None
             yield reading
         if self._error is not None:
@@ -300,7 +289,7 @@ class LiveReader(FrameReader):
             If there is no such sink, or it cannot be opened.
         """
         for name in sinks:
-            self.senders.append(sender := Sender(name))
+            self.outputs += (sender := Sender(name),)
             self.subscribe(sender.add)
 
     def record(self, folder: Path | str, *, facts: TrialFacts | None = None) -> Recorder:
@@ -324,7 +313,8 @@ class LiveReader(FrameReader):
             if profile is not None:
                 save_profile(Path(folder), profile)
             stack.pop_all()
-        self.recorder = self._last_recorder = recorder
+        self.recorder = recorder
+        self.outputs = (recorder, *(output for output in self.outputs if isinstance(output, Sender)))
         return recorder
 
     def stop_recording(self) -> Dataset | None:
@@ -333,15 +323,15 @@ class LiveReader(FrameReader):
         return None if recorder is None else recorder.close()
 
     def _end_outputs(self) -> None:
-        for outlet in self.senders:
-            if not outlet.finish(_FLUSH_S):
-                outlet.close(discard=True)
+        for output in self.outputs:
+            if isinstance(output, Sender) and not output.finish(_FLUSH_S):
+                output.shut(discard=True)
         self.stop_recording()
 
     def _end(self) -> None:
         self._stopped.set()
         self.source.close()
-        self._frames.close()
+        self._frames.shut()
 
     def _run(self, job: Callable[[], None], end: Callable[[], None]) -> None:
         try:
@@ -407,7 +397,7 @@ class LiveReader(FrameReader):
     def _publish(self, reading: Reading, frame: LiveFrame | None) -> None:
         self.source.update_reading(reading)
         with self._news:
-            self._newest, self._published = reading, self._published + 1
+            self._newest = reading
             self._news.notify_all()
         for callback in tuple(self._subscribers):
             callback(reading, frame)

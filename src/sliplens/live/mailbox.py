@@ -1,7 +1,7 @@
 """Hand-over between threads: a mailbox for the newest items, and an outlet that works them off."""
 
+from abc import abstractmethod
 from collections import deque
-from collections.abc import Callable
 from threading import Condition, Thread
 from typing import Generic, TypeVar
 
@@ -30,7 +30,7 @@ class Mailbox(Generic[Item]):
             self._items.append(item)
             self._changed.notify_all()
 
-    def close(self, *, discard: bool = False) -> None:
+    def shut(self, *, discard: bool = False) -> None:
         """Wake the waiting thread: no more items come; with `discard` those that wait are lost."""
         with self._changed:
             self.closed = True
@@ -53,32 +53,18 @@ class Outlet(Mailbox[Item]):
     ----------
     name
         Folder of the recording, or name of the sink.
-    send
-        Called with each item; after an exception nothing more is sent, and `error` is set.
-    end
-        Called once, in the same thread, when no more will be sent.
     most_bytes
         Size of the items that may wait; of more, the oldest is lost.
-    cure
-        Cure where it fails.
-    verb
-        What it does with an item.
     """
 
-    def __init__(
-        self,
-        name: str,
-        send: Callable[[Item], None],
-        end: Callable[[], None],
-        *,
-        most_bytes: int,
-        cure: str,
-        verb: str = "sent",
-    ) -> None:
+    verb = "sent"
+    """Action with an item, in messages."""
+    cure = "begin it anew"
+
+    def __init__(self, name: str, *, most_bytes: int) -> None:
         super().__init__(most_bytes=most_bytes)
-        self.name, self._send, self._end, self._cure, self._verb = name, send, end, cure, verb
-        self.sent = 0
-        """Frames that are on disk, or readings that the sink took."""
+        self.name, self.sent = name, 0
+        """Number of frames that are on disk, or of readings that the sink took."""
         self.error: Exception | None = None
         """Exception that ended it before it was closed."""
         self._thread = Thread(target=self._run, daemon=True)
@@ -86,7 +72,15 @@ class Outlet(Mailbox[Item]):
 
     def __str__(self) -> str:
         lost = f", {self.lost:,} lost" if self.lost else ""
-        return f"{self.name}: {self.sent:,} {self._verb}{lost}{f'; {self.trouble}' if self.trouble else ''}"
+        return f"{self.name}: {self.sent:,} {self.verb}{lost}{f'; {self.trouble}' if self.trouble else ''}"
+
+    @abstractmethod
+    def _send(self, item: Item) -> None:
+        """Hand on an item; after an exception nothing more is sent."""
+
+    @abstractmethod
+    def _end(self) -> None:
+        """End, once no more is sent."""
 
     @property
     def trouble(self) -> str | None:
@@ -94,11 +88,11 @@ class Outlet(Mailbox[Item]):
         if self.error is None:
             return None
         reason = (self.error.strerror if isinstance(self.error, OSError) else None) or self.error
-        return f"{self.name} stopped after {self.sent:,} were {self._verb} ({reason}); {self._cure}"
+        return f"{self.name} stopped after {self.sent:,} were {self.verb} ({reason}); {self.cure}"
 
     def finish(self, patience_s: float) -> bool:
         """Take no more, and wait until all are handed on; False where that takes longer."""
-        self.close()
+        self.shut()
         self._thread.join(patience_s)
         return not self._thread.is_alive()
 
@@ -110,7 +104,7 @@ class Outlet(Mailbox[Item]):
         except Exception as error:  # any: the producer reports it
             self.error = error
             self.lost += 1
-            self.close(discard=True)
+            self.shut(discard=True)
         try:
             self._end()
         except Exception as error:

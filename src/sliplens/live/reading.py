@@ -231,36 +231,42 @@ def describe_reading(reading: Reading) -> ReadingWords:
     >>> print(describe_reading(reading))
     margin 55 % (15 to 90 %); cannot tell: may be close to slipping
     """
-    zone, slips = _zone(*_ends(reading, risk=reading.risk)), reading.slip is SlipState.SLIP
+    low, high, risk = 0.0, 1.0, reading.risk or 0.0
+    margin = interval = ""
+    doubtful, slips = risk > _DOUBT, reading.slip is SlipState.SLIP
+    if reading.margin is not None:
+        margin = f"{100 * reading.margin:.0f} %"
+        if reading.low is not None and reading.high is not None:
+            low, high = round(reading.low, 2), round(reading.high, 2)
+            interval = f"{100 * low:.0f} to {100 * high:.0f} %"
+            if risk > _RISK:  # more than the interval states
+                stated = _zone(low, high)
+                low = round(min(reading.low, max(reading.margin - OFF, 0.0)), 2)
+                high = round(max(reading.high, min(reading.margin + OFF, 1.0)), 2)
+                if _zone(low, high) is not stated:
+                    interval += f", but {100 * OFF:.0f} points off with a chance of {100 * risk:.0f} %"
+    zone = _zone(low, high)
     rules = (
         (reading.withheld is not None, Zone.NONE, f"no margin: {reading.withheld}"),
         (slips and zone in {Zone.BELOW, Zone.UNCERTAIN}, Zone.BELOW, "slips, as the markers show: hold tighter"),
         (slips, Zone.UNCERTAIN, "cannot tell: the markers show a slip, the margin does not"),
         (reading.margin is None, Zone.NONE, NO_NETWORK),
         (reading.low is None, Zone.UNCERTAIN, "cannot tell: the network was never calibrated, and gives no interval"),
-        ((reading.risk or 0) > _DOUBT, Zone.UNCERTAIN, "cannot tell: the margin is more likely wrong than right"),
+        (doubtful, Zone.UNCERTAIN, "cannot tell: the margin is more likely wrong than right"),
         (True, zone, _ADVICE[zone]),
     )
     zone, advice = next((then, words) for applies, then, words in rules if applies)
-    margin = interval = ""
-    if reading.margin is not None:
-        margin = f"{100 * reading.margin:.0f} %"
-        if reading.low is not None and reading.high is not None:
-            low, high = _ends(reading, risk=None)
-            interval = f"{100 * low:.0f} to {100 * high:.0f} %"
-            if _zone(low, high) is not _zone(*_ends(reading, risk=reading.risk)):
-                interval += f", but {100 * OFF:.0f} points off with a chance of {100 * (reading.risk or 0):.0f} %"
-    return ReadingWords(zone=zone, advice=advice, margin=margin, interval=interval, contact=_contact(reading, zone))
-
-
-def _ends(reading: Reading, *, risk: float | None) -> tuple[float, float]:
-    """Round the ends of the interval to percents; widen it where the risk is more than it states."""
-    margin, low, high = reading.margin, reading.low, reading.high
-    if margin is None or low is None or high is None:
-        return 0.0, 1.0
-    if risk is not None and risk > _RISK:
-        low, high = min(low, max(margin - OFF, 0.0)), max(high, min(margin + OFF, 1.0))
-    return round(low, 2), round(high, 2)
+    touches = reading.margin is not None or (reading.markers is not None and reading.markers.contact)
+    agree = reading.withheld is None and touches and not (zone is Zone.UNCERTAIN if slips else doubtful)
+    states = (
+        (reading.contact_state == ContactState.NO_CONTACT, ContactState.NO_CONTACT),
+        (not agree, ContactState.UNKNOWN),
+        (slips, ContactState.FULL_SLIP),
+        (low > 0 and high < 1, ContactState.INCIPIENT_SLIP),
+        (True, ContactState.CONTACT),
+    )
+    contact = next(state for applies, state in states if applies)
+    return ReadingWords(zone=zone, advice=advice, margin=margin, interval=interval, contact=contact)
 
 
 def _zone(low: float, high: float) -> Zone:
@@ -271,21 +277,6 @@ def _zone(low: float, high: float) -> Zone:
     if high > most:
         return Zone.ABOVE if low >= most else Zone.NOT_BELOW
     return Zone.WITHIN
-
-
-def _contact(reading: Reading, zone: Zone) -> ContactState:
-    """State of the contact as far as interval and markers agree."""
-    low, high = _ends(reading, risk=reading.risk)
-    touches = reading.margin is not None or (reading.markers is not None and reading.markers.contact)
-    if reading.contact_state == ContactState.NO_CONTACT:
-        return ContactState.NO_CONTACT
-    if reading.withheld is not None or not touches:
-        return ContactState.UNKNOWN
-    if reading.slip is SlipState.SLIP:
-        return ContactState.UNKNOWN if zone is Zone.UNCERTAIN else ContactState.FULL_SLIP
-    if (reading.risk or 0) > _DOUBT:
-        return ContactState.UNKNOWN
-    return ContactState.INCIPIENT_SLIP if low > 0 and high < 1 else ContactState.CONTACT
 
 
 __all__ = [

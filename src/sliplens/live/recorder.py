@@ -1,8 +1,9 @@
 """Recording a running source into a data set, frame by frame, and force samples that come as lines of text."""
 
+import itertools
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache
@@ -28,9 +29,10 @@ from sliplens.recordings.trial import TrialFacts
 
 _MOST_WAITING_BYTES = 256 * 2**20
 _STUCK_S = 30.0  # in which not a single frame could be written
+_FACTS = TrialFacts(trial="live")
 
 
-class Recorder:
+class Recorder(Outlet[tuple[LiveFrame, Frame | None]]):
     """Records frames into a data set, a new one or one that is there, as trials `NAME-1`, `NAME-2` and so on.
 
     A trial ends, and the next begins, where the reference is taken anew, the size changes or the clock jumps back. A
@@ -53,36 +55,29 @@ class Recorder:
         If the folder is something else, or is being recorded.
     """
 
+    verb, cure = "recorded", "make room, and record again: what is there stays"
+
     def __init__(
         self,
         folder: Path | str,
         *,
-        facts: TrialFacts | None = None,
+        facts: TrialFacts = _FACTS,
         source: str = "frames in memory",
         simulated: bool = False,
     ) -> None:
-        self.folder = Path(folder)
-        self._facts = facts or TrialFacts(trial="live")
-        require_trial_name(self._facts.trial)
-        self._source, (lock, taken) = source, begin_recording(self.folder, simulated=simulated)
+        self.folder, self._facts, self._source = Path(folder), facts, source
+        require_trial_name(facts.trial)
+        lock, taken = begin_recording(self.folder, simulated=simulated)
         self._finish, self._taken = cache(lambda: finish_recording(self.folder, lock)), set(taken)
         self._journal: Journal | None = None
         self._last: LiveFrame | None = None
         self._first_s = 0.0
         self._reference: Frame | None = None
-        self.outlet = Outlet(
-            str(self.folder),
-            self._append,
-            self._end_trial,
-            most_bytes=_MOST_WAITING_BYTES,
-            cure="make room, and record again: what is there stays",
-            verb="recorded",
-        )
-        """Thread that writes frames, with their number."""
+        super().__init__(str(folder), most_bytes=_MOST_WAITING_BYTES)
 
     def add(self, frame: LiveFrame, reference: Frame | None = None) -> None:
         """Take a frame, and the sensor untouched; another thread writes it, or loses it where that is far behind."""
-        self.outlet.put((frame, reference), size_bytes=frame.image.nbytes)
+        self.put((frame, reference), size_bytes=frame.image.nbytes)
 
     def close(self) -> Dataset | None:
         """Write the waiting frames and make trials; None where there is no frame at all.
@@ -94,42 +89,39 @@ class Recorder:
         OSError
             If there is no room; the same holds.
         """
-        outlet, written = self.outlet, -1
-        while not outlet.finish(_STUCK_S):
-            if outlet.sent == written:
-                outlet.close(discard=True)
+        written = -1
+        while not self.finish(_STUCK_S):
+            if self.sent == written:
+                self.shut(discard=True)
                 raise RecordingError(
-                    f"{self.folder} takes no more frames, {outlet.sent} were written; end this program and look after "
+                    f"{self.folder} takes no more frames, {written} were written; end this program and look after "
                     f"the disk, then run `sliplens recover {self.folder}`"
                 )
-            written = outlet.sent
+            written = self.sent
         self._finish()
-        return load_dataset(self.folder) if outlet.sent else None
+        return load_dataset(self.folder) if self.sent else None
 
-    def _append(self, item: tuple[LiveFrame, Frame | None]) -> None:
+    def _send(self, item: tuple[LiveFrame, Frame | None]) -> None:
         (frame, reference), last = item, self._last
         goes_on = last is not None and frame.size == last.size and frame.time_s > last.time_s
         is_same = reference is self._reference or np.array_equal(np.asarray(reference), np.asarray(self._reference))
         if self._journal is None or not goes_on or not is_same:
             self._begin_trial(frame, reference)
         assert self._journal is not None
-        forces = frame.forces
-        if forces is not None:
-            forces = replace(forces, time_s=forces.time_s - self._first_s)
-        time_s = frame.time_s - self._first_s
-        self._journal.append(frame.image, time_s=time_s, safety_margin=frame.safety_margin, forces=forces)
+        first_s, forces = self._first_s, frame.forces
+        forces = None if forces is None else replace(forces, time_s=forces.time_s - first_s)
+        margin = frame.safety_margin
+        self._journal.append(frame.image, time_s=frame.time_s - first_s, safety_margin=margin, forces=forces)
         self._last = frame
 
-    def _end_trial(self) -> None:
+    def _end(self) -> None:
         if self._journal is not None:
             self._journal.close()
 
     def _begin_trial(self, frame: LiveFrame, reference: Frame | None) -> None:
-        self._end_trial()
-        number = 1
-        while f"{self._facts.trial}-{number}" in self._taken:
-            number += 1
-        facts = replace(self._facts, trial=f"{self._facts.trial}-{number}")
+        self._end()
+        names = (f"{self._facts.trial}-{number}" for number in itertools.count(1))
+        facts = replace(self._facts, trial=next(name for name in names if name not in self._taken))
         forces = None if frame.forces is None else frame.forces.source
         header = JournalHeader(facts=facts, source=self._source, size=frame.size, forces=forces)
         fits = reference is not None and reference.shape == frame.image.shape
@@ -185,19 +177,37 @@ class ForceStream:
         return replace(frame, forces=Forces(time_s=time_s[good], force_n=force_n[good], source=str(self.path)))
 
     def _follow(self, begin: int) -> None:
+        path, times = self.path, ()
         try:
-            with self.path.open(encoding="utf-8") as file:
+            with path.open(encoding="utf-8") as file:
                 lines = self._lines(file)
-                parse = _line_parser(self.path, next(lines, "time_s,fx,fy,fz"))
+                header = next(lines, "time_s,fx,fy,fz")
+                separator = next((mark for mark in ("\t", ";", ",") if mark in header), ",")
+                names = tuple(name.strip() for name in header.split(separator))
+                forces = guess_force_columns(names, path=path)
+                with suppress(RecordingError):
+                    times = (guess_time_column(names, path=path),)
+                columns = [
+                    (names.index(name), UNITS[quantity][unit_of(name, quantity=quantity, path=path) or unit][0])
+                    for quantity, unit, columns in (("force", "N", forces), ("time", "s", times))
+                    for name in columns
+                ]
                 if file.seekable():
                     file.seek(max(begin, file.tell()))  # past the names, if those came later
                 for line in lines:
-                    stamp_s, force_n = parse(line)
-                    arrived_s = time.monotonic()
+                    arrived_s, fields = time.monotonic(), line.split(separator)
+                    if len(fields) < len(names):
+                        counts = f"{len(fields)} columns, {len(names)} are named"
+                        self.trouble = f"{path} has a line of {counts}; the forces of {path} end here"
+                        return
+                    values = [float(fields[at]) * scale for at, scale in columns]
+                    force_n, stamp_s = values[: len(forces)], values[-1] if times else np.nan
+                    if len(force_n) == 2:  # normal and tangential, as `import` lays them along z and x
+                        force_n = [force_n[1], 0.0, force_n[0]]
                     self._delay_s = min(self._delay_s, arrived_s - stamp_s)  # as it is, where that is NaN
                     self._samples.append((stamp_s, arrived_s, *force_n))
         except (RecordingError, OSError, ValueError) as error:
-            self.trouble = f"{error}; the forces of {self.path} end here"
+            self.trouble = f"{error}; the forces of {path} end here"
 
     def _lines(self, file: TextIO) -> Iterator[str]:
         """Iterate over whole lines as they are written, until closed; comments are passed over."""
@@ -210,30 +220,6 @@ class ForceStream:
             if text.strip() and not text.startswith(("#", "%")):
                 yield text.strip()
             text = ""
-
-
-def _line_parser(path: Path, header: str) -> Callable[[str], tuple[float, list[float]]]:
-    """Return the function that reads a line of a table of forces, by the names of its columns."""
-    separator = next((mark for mark in ("\t", ";", ",") if mark in header), ",")
-    names = tuple(name.strip() for name in header.split(separator))
-
-    def column(name: str, quantity: str, unit: str) -> tuple[int, float]:
-        return names.index(name), UNITS[quantity][unit_of(name, quantity=quantity, path=path) or unit][0]
-
-    forces, stamp = [column(name, "force", "N") for name in guess_force_columns(names, path=path)], None
-    with suppress(RecordingError):
-        stamp = column(guess_time_column(names, path=path), "time", "s")
-
-    def parse(line: str) -> tuple[float, list[float]]:
-        fields = line.split(separator)
-        if len(fields) < len(names):
-            raise RecordingError(f"{path} has a line of {len(fields)} columns, {len(names)} are named")
-        force = [float(fields[at]) * scale for at, scale in forces]
-        if len(force) == 2:  # normal and tangential, as `import` lays them along z and x
-            force = [force[1], 0.0, force[0]]
-        return float(fields[stamp[0]]) * stamp[1] if stamp else np.nan, force
-
-    return parse
 
 
 __all__ = ["ForceStream", "Recorder"]

@@ -70,32 +70,28 @@ def _open_json(address: str) -> Sink:
 
 READING_TOPIC, IMAGE_TOPIC = "/sliplens/reading", "/sliplens/image"
 """Topics of MCAP files: readings and frames (`foxglove.CompressedImage`), both as JSON."""
-_FIELDS = {"frame_id": {"type": "string"}, "format": {"type": "string"}}
-_FIELDS |= {
+_FIELDS = {
     "timestamp": {"type": "object", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}},
+    "frame_id": {"type": "string"},
+    "format": {"type": "string"},
     "data": {"type": "string", "contentEncoding": "base64"},
 }
 
 
 def _open_mcap(address: str) -> Sink:
     """Write readings and frames into an MCAP file, which Foxglove opens."""
-    path = _new_file(address, kind="mcap", suffix=".mcap")
     require_packages("mcap", extra="sinks", purpose="--sink mcap")
     from mcap.writer import Writer  # noqa: PLC0415 (an extra)
 
-    try:
-        file = path.open("xb")
-    except OSError as error:
-        raise InputError(f"{path} cannot be written ({error.strerror}); name another file") from None
+    file = _new_file(address, kind="mcap", suffix=".mcap").open("wb")
     writer = Writer(file)
     writer.start()
-
-    def add_topic(topic: str, name: str, schema: bytes) -> int:
-        return writer.register_channel(topic, "json", writer.register_schema(name, "jsonschema", schema))
-
-    readings = add_topic(READING_TOPIC, "Reading", reading_schema())
     image_schema = msgspec.json.encode({"type": "object", "properties": _FIELDS})
-    images = add_topic(IMAGE_TOPIC, "foxglove.CompressedImage", image_schema)
+    schemas = {"Reading": reading_schema(), "foxglove.CompressedImage": image_schema}
+    readings, images = (
+        writer.register_channel(topic, "json", writer.register_schema(name, "jsonschema", schema))
+        for topic, (name, schema) in zip((READING_TOPIC, IMAGE_TOPIC), schemas.items(), strict=True)
+    )
 
     def send(reading: Reading, image: Frame | None) -> None:
         at_ns, (seconds, nanoseconds) = _stamp(reading)
@@ -113,13 +109,14 @@ def _open_mcap(address: str) -> Sink:
 
 
 def _new_file(address: str, *, kind: str, suffix: str) -> Path:
+    """Make a file that does not exist."""
     path = Path(address)
     if path.suffix != suffix:
         raise InputError(f"--sink {kind} writes a file that ends in {suffix}; give {kind}:grip{suffix}")
-    if path.exists():
-        raise InputError(f"{path} is there already; name another file, or move it away")
-    if not path.parent.is_dir():
-        raise InputError(f"the folder {path.parent} does not exist; make it, or name another file")
+    try:
+        path.open("xb").close()
+    except OSError as error:
+        raise InputError(f"{path} cannot be written ({error.strerror}); name a new file in a folder") from None
     return path
 
 
@@ -191,8 +188,8 @@ class RerunSink:
 
 
 def _open_rerun(address: str) -> Sink:
-    path, sink = _new_file(address, kind="rerun", suffix=".rrd"), RerunSink()
-    sink.stream.save(path)
+    sink = RerunSink()
+    sink.stream.save(_new_file(address, kind="rerun", suffix=".rrd"))
     sink.send_layout()
     return Sink(sink.send, sink.close)
 
@@ -364,9 +361,14 @@ class Sender(Outlet[tuple[Reading, Frame | None]]):
     """Outlet of readings to a sink, by its name: a slow one loses readings, and delays none."""
 
     def __init__(self, name: str) -> None:
-        sink = open_sink(name)
-        most_bytes, cure = _MOST_WAITING_BYTES, "begin it anew"
-        super().__init__(name, lambda item: sink.send(*item), sink.close, most_bytes=most_bytes, cure=cure)
+        self._sink = open_sink(name)
+        super().__init__(name, most_bytes=_MOST_WAITING_BYTES)
+
+    def _send(self, item: tuple[Reading, Frame | None]) -> None:
+        self._sink.send(*item)
+
+    def _end(self) -> None:
+        self._sink.close()
 
     def add(self, reading: Reading, frame: LiveFrame | None) -> None:
         """Take a reading and its frame, without waiting."""

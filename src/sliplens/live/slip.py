@@ -70,16 +70,6 @@ class ContactStates:
     """Time since a slip began that is confirmed in this frame; NaN elsewhere."""
 
 
-class _Recoil(NamedTuple):
-    """A contact as its skin began to spring back."""
-
-    time_s: float
-    spread: float
-    hold: Float[np.ndarray, "2 markers"]
-    inner: Bool[np.ndarray, " markers"]
-    shear_px: Float[np.ndarray, "2"]
-
-
 class _Frame(NamedTuple):
     """Markers of one frame: motion since they were untouched, 0 where one is not seen."""
 
@@ -87,6 +77,15 @@ class _Frame(NamedTuple):
     spread: Contacts
     moved: Float[np.ndarray, "contacts 2 markers"]
     visible: Bool[np.ndarray, "contacts markers"]
+
+
+class _Recoil(NamedTuple):
+    """A contact as its skin began to spring back."""
+
+    time_s: float
+    frame: _Frame
+    hold: Float[np.ndarray, "2 markers"]
+    inner: Bool[np.ndarray, " markers"]
 
 
 class SlipBatch:
@@ -178,23 +177,22 @@ class SlipBatch:
         confirmed_s, newest = np.full(len(self._rest), np.nan), self._frames[-1]
         for row in np.flatnonzero(springs).tolist():
             if row not in self._recoils_at and self._slip_s[row] != self._judged_s[row]:
-                first = self._frames[-int(self._window[row])]
+                first, began_s = self._frames[-int(self._window[row])], float(self._slip_s[row])
                 middle = self._inner[row] & first.visible[row]
-                hold, began_s, spread = self._hold[row].copy(), float(self._slip_s[row]), float(first.spread[row])
-                shear_px = (first.moved[row] - hold)[:, middle].mean(axis=1)
-                self._recoils_at[row] = _Recoil(began_s, spread, hold, middle, shear_px)
-        for row, recoil in list(self._recoils_at.items()):
-            if not self._pressed[row] or time_s - recoil.time_s > 2 * _CONFIRMED_S:
-                del self._recoils_at[row]
-            elif time_s - recoil.time_s >= _CONFIRMED_S:
-                del self._recoils_at[row]
-                self._judged_s[row] = recoil.time_s
-                middle = recoil.inner & newest.visible[row]
-                shear_px = (newest.moved[row] - recoil.hold)[:, middle].mean(axis=1) if middle.any() else np.zeros(2)
-                carried = float(shear_px @ recoil.shear_px) / max(float(recoil.shear_px @ recoil.shear_px), 1e-9)
-                tightened = newest.spread[row] > _TIGHTENED * recoil.spread
-                if carried >= (_CARRIED_TIGHTENED if tightened else _CARRIED):
-                    confirmed_s[row] = time_s - recoil.time_s
+                self._recoils_at[row] = _Recoil(began_s, first, self._hold[row].copy(), middle)
+        for row, (began_s, first, hold, middle) in list(self._recoils_at.items()):
+            if self._pressed[row] and time_s - began_s < _CONFIRMED_S:
+                continue
+            del self._recoils_at[row]
+            if not self._pressed[row] or time_s - began_s > 2 * _CONFIRMED_S:
+                continue
+            self._judged_s[row], seen = began_s, middle & newest.visible[row]
+            before_px = (first.moved[row] - hold)[:, middle].mean(axis=1)
+            after_px = (newest.moved[row] - hold)[:, seen].mean(axis=1) if seen.any() else np.zeros(2)
+            carried = float(after_px @ before_px) / max(float(before_px @ before_px), 1e-9)
+            tightened = newest.spread[row] > _TIGHTENED * first.spread[row]
+            if carried >= (_CARRIED_TIGHTENED if tightened else _CARRIED):
+                confirmed_s[row] = time_s - began_s
         return confirmed_s
 
     def _learn_noise(self, moved: Fields, time_s: float) -> None:
@@ -259,23 +257,19 @@ class SlipBatch:
 
     def _shorten_windows(self, time_s: float) -> None:
         """Take frames that are too old out of each window, and into the pattern."""
-        frames = self._frames
-        times = np.array([frame.time_s for frame in frames])
-        while True:
-            first = len(times) - np.maximum(self._window, 1)
-            late = (self._window > _FEWEST_FRAMES) & (time_s - times[first] > _WINDOW_S)
-            for at in np.unique(first[late]).tolist():
-                rows = np.flatnonzero(late & (first == at))
-                share = -np.expm1(-(times[at + 1] - times[at]) / _PATTERN_S)
-                field = np.where(frames[at].visible[rows][:, None], frames[at].moved[rows] - self._hold[rows], np.nan)
-                pattern = self._pattern[rows]
-                blended = pattern + share * (field - pattern)
-                # a marker that was not seen keeps what it had
-                self._pattern[rows] = np.where(np.isnan(blended), np.where(np.isnan(pattern), field, pattern), blended)
-            self._window -= late
-            if not late.any():
-                break
-        for _ in range(len(frames) - max(1, int(self._window.max()))):
+        frames, count = self._frames, len(self._frames)
+        times = [frame.time_s for frame in frames]
+        most = max(_FEWEST_FRAMES, sum(time_s - then_s <= _WINDOW_S for then_s in times))
+        for at in range(count - int(self._window.max()), count - most):
+            rows = np.flatnonzero(self._window >= count - at)
+            share = -np.expm1((times[at] - times[at + 1]) / _PATTERN_S)
+            field = np.where(frames[at].visible[rows][:, None], frames[at].moved[rows] - self._hold[rows], np.nan)
+            pattern = self._pattern[rows]
+            blended = pattern + share * (field - pattern)
+            # a marker that was not seen keeps what it had
+            self._pattern[rows] = np.where(np.isnan(blended), np.where(np.isnan(pattern), field, pattern), blended)
+        self._window = np.minimum(self._window, most)
+        for _ in range(count - max(1, int(self._window.max()))):
             frames.popleft()
 
     def _recoils(self) -> Contacts:
@@ -305,51 +299,36 @@ class SlipBatch:
         inside = inside[:, enough].T
         old = np.cumsum(inside, axis=1)[:, :-1]
         new, old, is_cut = self._window[rows, None] - old, np.maximum(old, 1), old > 0
-        wide = np.sqrt(1 / old + 1 / new)
-
-        def drops(ways: Fields, of: slice | np.ndarray) -> Float[np.ndarray, "rows cuts"]:
-            """Compute the fall of the mean motion along a field from before each cut to after it."""
-            heights = [np.einsum("rkm,rkm->r", frame.moved[rows[of]], ways) for frame in frames]
-            total = np.cumsum(np.stack(heights, axis=-1) * inside[of], axis=-1)
-            return total[:, :-1] / old[of] - (total[:, -1:] - total[:, :-1]) / new[of]
-
-        def at_cut(values: np.ndarray) -> np.ndarray:
-            return np.take_along_axis(values, cut[:, None], axis=-1)[:, 0]
-
         # the press is no part of the pattern, so that it need not be subtracted
-        drops_px = drops(pattern, slice(None))
+        heights_px = np.stack([np.einsum("rkm,rkm->r", frame.moved[rows], pattern) for frame in frames], axis=-1)
+        total = np.cumsum(heights_px * inside, axis=-1)
+        drops_px, wide = total[:, :-1] / old - (total[:, -1:] - total[:, :-1]) / new, np.sqrt(1 / old + 1 / new)
         cut = np.where(is_cut, drops_px / wide, -np.inf).argmax(axis=-1)
-        drop, wide = at_cut(drops_px), at_cut(wide)
+        drop, wide = (np.take_along_axis(values, cut[:, None], axis=-1)[:, 0] for values in (drops_px, wide))
         whole = drop / wide / self._together_px[rows]
-        springs = np.flatnonzero((drop >= _FALL * length) & (whole >= _RECOIL))
-        if not len(springs):
-            return began_s
-        shifts = [_unit(valid[springs, None] * np.array(way)) for way in ([[1.0], [0.0]], [[0.0], [1.0]])]
-        turn = _unit(arm[springs][:, ::-1] * np.array([[-1.0], [1.0]]))
-        bent = _without(pattern[springs], *shifts, turn)
-        residual = np.sqrt(np.einsum("rkm,rkm->r", bent, bent))
-        bending = np.take_along_axis(drops(_unit(bent), springs), cut[springs, None], axis=-1)[:, 0]
-        bending = bending / wide[springs] / self._noise_px[rows[springs]]
-        # a large motion must show more than noise that happens to bend
-        bends = springs[bending >= np.maximum(_EVIDENCE, _BENT_SHARE * residual * whole[springs])]
-        bends = bends[~self._handled(rows[bends], cut[bends], inside[bends].T, valid[bends], drop[bends])]
-        began_s[rows[bends]] = np.array([frame.time_s for frame in frames])[cut[bends]]
+        for at in np.flatnonzero((drop >= _FALL * length) & (whole >= _RECOIL)).tolist():
+            row, seen, first = int(rows[at]), valid[at], len(frames) - int(self._window[rows[at]])
+            # means over the frames before the cut and after it
+            halves = frames[first : cut[at] + 1], frames[cut[at] + 1 :]
+            before, after = (np.mean([frame.moved[row] for frame in half], axis=0) for half in halves)
+            bent, way = pattern[at], arm[at][::-1] * np.array([[-1.0], [1.0]])
+            bent = _without(bent[None], *(_unit(rigid[None]) for rigid in (*np.eye(2)[..., None] * seen, way)))[0]
+            residual = np.linalg.norm(bent)
+            bending = np.sum((before - after) * bent) / max(residual, 1e-9) / wide[at] / self._noise_px[row]
+            # a large motion must show more than noise that happens to bend
+            if bending < max(_EVIDENCE, _BENT_SHARE * residual * whole[at]):
+                continue
+            # a contact that was let go, or pressed or pulled further, was handled
+            inner = seen & self._inner[row] if (seen & self._inner[row]).any() else seen
+            from_px, to_px = (
+                np.linalg.norm((mean - self._hold[row])[:, inner].mean(axis=1)) for mean in (before, after)
+            )
+            loose, tight = (np.mean([frame.spread[row] for frame in half]) for half in halves)
+            pressed_px = abs(loose - tight) / 2 * self._reach_px[row]
+            is_pulled = to_px - from_px > _RECOIL * self._middle_noise_px()[row]
+            if not is_pulled and pressed_px <= drop[at] / np.sqrt(seen.sum()):
+                began_s[row] = frames[cut[at]].time_s
         return began_s
-
-    def _handled(self, rows: Rows, cut: Rows, inside: Fields, valid: Fields, drop: Contacts) -> Fields:
-        """True where a contact was let go, pressed or pulled further after a frame of the window."""
-        old = np.arange(len(inside))[:, None] <= cut
-        # weights of the means before the cut and after it
-        shares = [some / np.maximum(some.sum(axis=0), 1) for some in (old & inside, ~old & inside)]
-        spread = np.stack([frame.spread[rows] for frame in self._frames])
-        pressed = np.abs((spread * (shares[0] - shares[1])).sum(axis=0))
-        inner = valid & self._inner[rows]
-        markers = np.expand_dims(np.where(inner.any(axis=1, keepdims=True), inner, valid), 1)
-        hold, count = np.where(markers, self._hold[rows], 0), np.count_nonzero(markers, axis=2)
-        sums = [(np.where(markers, frame.moved[rows], 0) - hold).sum(axis=2) / count for frame in self._frames]
-        before, after = (np.linalg.norm((np.stack(sums) * share[..., None]).sum(axis=0), axis=1) for share in shares)
-        pulled = after > before + _RECOIL * self._middle_noise_px()[rows]
-        return pulled | (pressed / 2 * self._reach_px[rows] > drop / np.sqrt(valid.sum(axis=1)))
 
 
 class SlipDetector:

@@ -1,6 +1,5 @@
 """Evaluation of slip detection on labelled clips, beside trivial baselines."""
 
-from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -14,8 +13,8 @@ from sliplens.errors import ImageError, InputError
 from sliplens.live.reading import SlipState
 from sliplens.live.slip import SlipDetector
 from sliplens.markers import track_markers
-from sliplens.progress import add_note, report_progress
-from sliplens.recordings.formats.tables import open_text_table
+from sliplens.progress import add_note, report_each
+from sliplens.recordings.formats.tables import open_text_table, to_number
 from sliplens.recordings.source import open_source
 
 Flags: TypeAlias = Bool[np.ndarray, " clips"]
@@ -79,21 +78,26 @@ def evaluate_slip(table: Path | str, *, after: int | None = None, markers: str =
     >>> import sliplens as sl
     >>> scores = sl.evaluate_slip("lifts.csv", after=10).scores  # doctest: +SKIP
     """
-    text = open_text_table(Path(table))
-    rows = [dict(zip(text.header, cells, strict=True)) for _, cells in text.rows]
+    text = open_text_table(path := Path(table))
     label = next((name for name in _LABELS if name in text.header), "slips")
     if not {label, "file"} <= set(text.header):
         raise InputError(f"{table} needs the columns file and slips; it has {', '.join(text.header)}")
-    numbers = {name: _numbers(rows, name, table) for name in (label, "start_frame", "width") if name in text.header}
-    slips, start = numbers[label] > 0, numbers.get("start_frame", np.zeros(len(rows))).astype(int)
+    lines = [(line, dict(zip(text.header, cells, strict=True))) for line, cells in text.rows]
+    numbers = {
+        name: np.array([to_number(row[name], path=path, line=line, column=name) for line, row in lines])
+        for name in (label, "start_frame", "width")
+        if name in text.header
+    }
+    slips, start = numbers[label] > 0, numbers.get("start_frame", np.zeros(len(lines))).astype(int)
     if slips.all() or not slips.any():
         raise InputError(f"the clips of {table} are all labelled alike; add clips that slip and clips that hold")
-    objects = np.array([row.get("object") or row["file"] for row in rows])
-    clips = np.empty((len(rows), 4))
-    for number, row in enumerate(rows):
+    if start.min() < 0:
+        raise InputError(f"start_frame of {table} is {start.min()}; count the frames from 0")
+    objects = np.array([row.get("object") or row["file"] for _, row in lines])
+    clips = np.empty((len(lines), 4))
+    for number, (_, row) in enumerate(report_each(lines)):
         chosen = slice(start[number], None if after is None else start[number] + after + 1)
-        clips[number] = _read_clip(Path(table).parent / row["file"], chosen, markers)
-        report_progress(number + 1, len(rows))
+        clips[number] = _read_clip(path.parent / row["file"], chosen, markers)
     detected, fall, displacement_px, frames = clips.T
     values = {"fall of the mean shear": fall, "largest displacement": displacement_px, "frame count": frames}
     if "width" in numbers:
@@ -103,16 +107,6 @@ def evaluate_slip(table: Path | str, *, after: int | None = None, markers: str =
     accuracy, low, high = np.array([score_guesses(guess, slips, objects) for guess in guesses.values()]).T
     scores = SlipScores(method=np.array(list(guesses)), balanced_accuracy=accuracy, low=low, high=high)
     return SlipEvaluation(scores=scores, detected=guesses["detector"], fall=fall, displacement_px=displacement_px)
-
-
-def _numbers(rows: list[dict[str, str]], column: str, table: Path | str) -> Float[np.ndarray, " rows"]:
-    values = np.full(len(rows), np.nan)
-    for number, row in enumerate(rows):
-        with suppress(ValueError):
-            values[number] = float(row[column])
-        if not 0 <= values[number] < np.inf:
-            raise InputError(f"{table}, row {number + 1}: {column} is {row[column]!r}; write a number of 0 or more")
-    return values
 
 
 def _read_clip(path: Path, chosen: slice, markers: str) -> tuple[bool, float, float, int]:
@@ -126,10 +120,8 @@ def _read_clip(path: Path, chosen: slice, markers: str) -> tuple[bool, float, fl
     except ImageError as error:
         add_note(f"{path.name} counts as not slipping: {error}")
         return False, 0.0, 0.0, len(capture)
-    detector = SlipDetector(tracks.rest_px)
-    readings = [
-        detector.update(place_px, number / capture.frame_rate_hz) for number, place_px in enumerate(tracks.position_px)
-    ]
+    detector, rate_hz = SlipDetector(tracks.rest_px), capture.frame_rate_hz
+    readings = [detector.update(place_px, number / rate_hz) for number, place_px in enumerate(tracks.position_px)]
     moved = np.ma.masked_invalid(tracks.displacement_px).mean(axis=1).filled(0)
     detected, fall = SlipState.SLIP in [reading.state for reading in readings], max(it.fall or 0.0 for it in readings)
     return detected, fall, float(np.linalg.norm(moved, axis=1).max()), len(capture)

@@ -50,32 +50,61 @@ _QUICK = {
 _CLOCKS_S = 10.0  # stamps of a camera that differ from the monotonic clock by more are of another one
 
 
-class StreamSource(LiveSource):
-    """Video that a network camera sends, as far as FFmpeg reads it: RTSP, HTTP, MPEG-TS over UDP or TCP, SRT."""
+class CameraSource(LiveSource):
+    """Camera at this machine (V4L2), or one in the network, as far as FFmpeg reads it: RTSP, HTTP, MPEG-TS, SRT.
+
+    A device is asked for MJPG, and for the size nearest to that of the options; its frames carry the stamps of the
+    kernel, and gaps between these count as lost frames. A larger picture of the same shape is scaled down.
+
+    Parameters
+    ----------
+    address
+        Device file, or address of a stream.
+    options
+        Rate and size; the camera's own where None.
+    """
 
     reconnects = True
 
-    def __init__(self, address: str, *, size: tuple[int, int] | None = None) -> None:
-        self.name, self._address, self._wanted = f"the stream {address}", address, size
+    def __init__(self, address: str, options: LiveOptions) -> None:
+        self._address, self._options, self._is_device = address, options, address.startswith("/dev/")
+        self.name = f"the {'camera' if self._is_device else 'stream'} {address}"
 
     def open(self, stack: ExitStack, /) -> None:
-        """Connect, and look for pictures."""
-        self._start(stack, self._connect(options=_QUICK, timeout=(_OPEN_S, _READ_S)))
+        """Open the device in the mode that suits the options, or connect."""
+        rate_hz, size = self._options.rate_hz, self._options.size or self._options.fit_size
+        if self._is_device:
+            settings = {"video_size": size and f"{size[1]}x{size[0]}", "framerate": rate_hz and f"{rate_hz:g}"}
+            settings = {name: value for name, value in settings.items() if value}
+            try:  # compressed first: what is not compressed fills the cable, and the rate falls
+                container = self._connect(format="v4l2", options={"input_format": "mjpeg"} | settings)
+            except SourceError:
+                container = self._connect(format="v4l2", options=settings)
+        else:
+            container = self._connect(options=_QUICK, timeout=(_OPEN_S, _READ_S))
+        self._container = stack.enter_context(container)
+        if not container.streams.video:
+            raise SourceError(f"{self.name} shows no pictures; name the address of a camera")
+        self._video = container.streams.video[0]
+        self._video.thread_type = "SLICE"  # by frame, each thread would keep one back
+        if self._is_device:
+            self._video.codec_context.options = {"err_detect": "explode"}
+        self.rate_hz = float(self._video.average_rate or 0) or None
+        self.size = height, width = self._video.codec_context.height, self._video.codec_context.width
+        self._scaled = size is not None and height * size[1] == width * size[0] and height >= size[0]
+        if size is not None and self._scaled:
+            self.size = size
+        elif self._options.size is not None:  # a network that needs another size says so itself
+            raise SourceError(
+                f"{self.name} gives {width}x{height} and not {self._options.size[1]}x{self._options.size[0]}; "
+                "choose a --size of the same shape and no larger"
+            )
 
     def _connect(self, **settings: Any) -> InputContainer:
         try:
             return av.open(self._address, **settings)
         except (FFmpegError, OSError, ValueError) as error:
             raise self._explained(error) from None
-
-    def _start(self, stack: ExitStack, container: InputContainer) -> None:
-        self._container = stack.enter_context(container)
-        if not container.streams.video:
-            raise SourceError(f"{self.name} shows no pictures; name the address of a camera")
-        self._video = container.streams.video[0]
-        self._video.thread_type = "SLICE"  # by frame, each thread would keep one back
-        self.size = self._wanted or (self._video.codec_context.height, self._video.codec_context.width)
-        self.rate_hz = float(self._video.average_rate or 0) or None
 
     def frames(self) -> Iterator[LiveFrame]:
         """Iterate over frames as they arrive; those that cannot be decoded are missing in the numbers."""
@@ -99,11 +128,14 @@ class StreamSource(LiveSource):
                 if frame.is_corrupt:
                     steps += 1
                     continue
-                time_s = arrived_s if frame.time is None else float(frame.time)
-                steps, captured_s = self._place(steps, time_s, last_s, arrived_s)
+                time_s = captured_s = arrived_s if frame.time is None else float(frame.time)
+                if self._is_device:
+                    steps = max(steps, round(np.nan_to_num(time_s - last_s) * (self.rate_hz or 0)))
+                if not self._is_device or abs(arrived_s - time_s) >= _CLOCKS_S:
+                    captured_s = arrived_s
                 number, steps, last_s = number + steps, 1, time_s
-                height, width = self._wanted or (frame.height, frame.width)
-                if self._wanted and frame.rotation % 180:
+                height, width = self.size if self._scaled else (frame.height, frame.width)
+                if self._scaled and frame.rotation % 180:
                     height, width = width, height
                 pixels = to_rgb.reformat(frame, width=width, height=height, format="rgb24", interpolation="AREA")
                 yield LiveFrame(
@@ -114,61 +146,11 @@ class StreamSource(LiveSource):
                     decode_ms=1e3 * (time.monotonic() - arrived_s),
                 )
 
-    def _place(self, steps: int, _time_s: float, _last_s: float, arrived_s: float) -> tuple[int, float]:
-        """Return the number of frames since the last one, and the time of the capture."""
-        return steps, arrived_s
-
     def _explained(self, error: Exception) -> SourceError:
-        reason = getattr(error, "strerror", None) or str(error)
-        return SourceError(f"{self.name} cannot be read ({reason}); check its address and that the camera runs")
-
-
-class CameraSource(StreamSource):
-    """V4L2 camera, in MJPG where it has that; its frames carry the stamps of the kernel.
-
-    The camera gives the size that is nearest to the one asked for; a larger picture of the same shape is scaled down.
-    Gaps between stamps count as lost frames.
-
-    Parameters
-    ----------
-    path
-        Device file.
-    options
-        Rate and size; the camera's own where None.
-    """
-
-    def __init__(self, path: Path, options: LiveOptions) -> None:
-        super().__init__(str(path))
-        self.name, self._options = f"the camera {path}", options
-
-    def open(self, stack: ExitStack, /) -> None:
-        """Open the device in the mode that suits the options, and start it."""
-        rate_hz, size = self._options.rate_hz, self._options.size or self._options.fit_size
-        settings = {"video_size": size and f"{size[1]}x{size[0]}", "framerate": rate_hz and f"{rate_hz:g}"}
-        settings = {name: str(value) for name, value in settings.items() if value}
-        try:  # compressed first: what is not compressed fills the cable, and the rate falls
-            container = self._connect(format="v4l2", options={"input_format": "mjpeg"} | settings)
-        except SourceError:
-            container = self._connect(format="v4l2", options=settings)
-        self._wanted = None
-        self._start(stack, container)
-        self._video.codec_context.options = {"err_detect": "explode"}
-        actual = self.size
-        if size is not None and actual[0] * size[1] == actual[1] * size[0] and actual[0] >= size[0]:
-            self.size = self._wanted = size
-        elif self._options.size is not None:  # a network that needs another size says so itself
-            raise SourceError(
-                f"{self.name} gives {actual[1]}x{actual[0]} and not {self._options.size[1]}x{self._options.size[0]}; "
-                "choose a --size of the same shape and no larger"
-            )
-
-    def _place(self, steps: int, time_s: float, last_s: float, arrived_s: float) -> tuple[int, float]:
-        steps = max(steps, round(np.nan_to_num(time_s - last_s) * (self.rate_hz or 0)))
-        return steps, time_s if abs(arrived_s - time_s) < _CLOCKS_S else arrived_s
-
-    def _explained(self, error: Exception) -> SourceError:
-        cure = _CURES.get(getattr(error, "errno", None) or 0, f"cannot be read ({error}); plug it in again")
-        return SourceError(f"{self.name} {cure}")
+        cure = "plug it in again" if self._is_device else "check its address and that the camera runs"
+        other = f"cannot be read ({getattr(error, 'strerror', None) or error}); {cure}"
+        number = getattr(error, "errno", None) if self._is_device else None
+        return SourceError(f"{self.name} {_CURES.get(number or 0, other)}")
 
 
 def list_cameras(folder: Path = Path("/sys/class/video4linux")) -> dict[str, str]:
@@ -351,13 +333,13 @@ _ROWS = {
     "camera": SourceKind(
         words="camera by its number or device file (0, or /dev/video0)",
         recognises=lambda name: name.isdecimal() or name.startswith("/dev/"),
-        open=lambda name, options: CameraSource(Path(f"/dev/video{int(name)}" if name.isdecimal() else name), options),
+        open=lambda name, options: CameraSource(f"/dev/video{int(name)}" if name.isdecimal() else name, options),
         takes=("rate_hz", "size"),
     ),
     "stream": SourceKind(
         words="network stream by its address (rtsp://, http://, udp://)",
         recognises=lambda name: name.partition("://")[0].lower() in _NETWORK and "://" in name,
-        open=lambda name, options: StreamSource(name, size=options.size),
+        open=CameraSource,
         takes=("size",),
     ),
     "replay": SourceKind(
@@ -413,6 +395,5 @@ def open_live(
 
 
 __all__ = [
-    "SOURCES", "CameraSource", "ReplaySource", "SimulatedSource", "StreamSource",
-    "list_cameras", "open_live",
+    "SOURCES", "CameraSource", "ReplaySource", "SimulatedSource", "list_cameras", "open_live",
 ]  # fmt: skip
