@@ -21,8 +21,10 @@ def shown(
     entities: dict[str, list[pa.RecordBatch]], entity: str, component: str, clock: str = "frame"
 ) -> tuple[list[int], list[Any]]:
     """Frames (or nanoseconds of the clock `time`) with a value of a component, in their order, and these values."""
-    batches = [batch for batch in entities[entity] if component in batch.schema.names]
-    columns = [(batch.column(clock).to_numpy().astype(np.int64), batch.column(component)) for batch in batches]
-    rows = [(at, value.as_py()) for times, values in columns for at, value in zip(times.tolist(), values, strict=True)]
-    rows = sorted(((at, value) for at, value in rows if value is not None), key=lambda row: row[0])
+    rows = []
+    for batch in entities[entity]:
+        if component in batch.schema.names:
+            times = batch.column(clock).to_numpy(zero_copy_only=False).astype(np.int64).tolist()
+            rows += zip(times, batch.column(component).to_pylist(), strict=True)
+    rows = sorted((row for row in rows if row[1] is not None), key=lambda row: row[0])
     return [at for at, _ in rows], [value for _, value in rows]

@@ -17,7 +17,7 @@ from sliplens.live.contract import LiveSource
 from sliplens.live.reading import LiveFrame, Reading
 from sliplens.models.checkpoint import Network
 
-plain_reader = partial(sl.LiveReader, health=None, slip=None, stall_s=10.0)
+plain_reader = partial(sl.LiveReader, health=None, slip=None, engine="torch", stall_s=10.0)
 """What is captured and read, without judging it, however slow the machine is."""
 
 
@@ -73,7 +73,7 @@ class Scripted(LiveSource):
             self.read.set()
 
         if not isinstance(reader, sl.LiveReader):
-            reader = plain_reader(self, reader, **{"engine": "torch"} | settings)
+            reader = plain_reader(self, reader, **settings)
         reader.subscribe(next_one)
         with reader:
             list(reader.readings())

@@ -15,10 +15,10 @@ import av
 import av.logging
 import numpy as np
 import pytest
-from PIL import Image
 from scripted import Scripted, frame_of, plain_reader
 
 from sliplens.errors import InputError, SourceError
+from sliplens.images import encode_jpeg
 from sliplens.live import CameraSource, LiveOptions, list_cameras, loop, open_live, sources
 from sliplens.live.reading import LiveFrame, Reading
 
@@ -140,9 +140,11 @@ def test_a_stream_is_read_and_its_end_is_told():
     np.testing.assert_allclose([given.image.mean() for given in images], 4 * np.arange(60)[-len(images) :], atol=4)
 
 
-def test_a_stream_that_is_not_there_is_told(unused_port: int):
+def test_a_stream_that_is_not_there_is_told():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
     with pytest.raises(SourceError, match=r"the stream tcp://127.0.0.1:\d+ cannot be read .*check its address"):
-        open_live(f"tcp://127.0.0.1:{unused_port}").__enter__()
+        open_live(f"tcp://127.0.0.1:{port}").__enter__()
 
 
 def test_a_stream_leads_to_no_file_of_this_machine(tmp_path: Path):
@@ -155,11 +157,12 @@ def test_a_stream_leads_to_no_file_of_this_machine(tmp_path: Path):
 
 
 class FakeCamera:
-    """Camera whose packets, in MJPEG, are a film: times in seconds and bytes, None for a whole picture."""
+    """Camera of 64 x 48 pixels whose packets, in MJPEG, are a film: times in seconds, and bytes."""
+
+    whole = encode_jpeg(np.tile(np.arange(64, dtype=np.uint8)[:, None], (48, 1, 3)), 95)
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.packets: list[tuple[float, bytes | None]] = [(0.0, None)]
-        self.size, self.formats, self.fails = (48, 64), {"mjpeg"}, list[OSError | None]()
+        self.packets, self.formats, self.fails = [(0.0, self.whole)], {"mjpeg"}, list[OSError | None]()
         self.asked: list[dict[str, str]] = []
         self.open = av.open
         monkeypatch.setattr(sources.av, "open", self.play)
@@ -171,16 +174,12 @@ class FakeCamera:
             raise failure
         if options.get("input_format", "yuyv422") not in self.formats:
             raise OSError(errno.EINVAL, "Invalid argument")
-        height, width = self.size
-        image = np.tile(np.arange(width, dtype=np.uint8)[:, None], (height, 1, 3))
-        buffer = io.BytesIO()
-        Image.fromarray(image).save(buffer, format="JPEG", quality=95)
         film = io.BytesIO()
         with self.open(film, "w", format="matroska") as out:
             stream = out.add_stream("mjpeg", rate=50)
-            stream.width, stream.height, stream.pix_fmt = width, height, "yuvj420p"
+            stream.width, stream.height, stream.pix_fmt = 64, 48, "yuvj420p"
             for time_s, data in self.packets:
-                packet = av.Packet(buffer.getvalue() if data is None else data)
+                packet = av.Packet(data)
                 packet.stream, packet.time_base = stream, Fraction(1, 1000)
                 packet.pts = packet.dts = round(1000 * time_s)
                 out.mux(packet)
@@ -195,7 +194,7 @@ def camera(monkeypatch: pytest.MonkeyPatch) -> FakeCamera:
 
 def test_a_camera_keeps_the_stamps_of_the_kernel_and_counts_what_is_lost(camera: FakeCamera):
     now_s = round(time.monotonic(), 3)
-    camera.packets = [(now_s, None), (now_s + 0.02, b"torn"), (now_s + 0.06, None)]
+    camera.packets = [(now_s, camera.whole), (now_s + 0.02, b"torn"), (now_s + 0.06, camera.whole)]
     frames: list[LiveFrame] = []
     with open_live("0") as source, pytest.raises(SourceError, match="has ended"):
         frames.extend(source.frames())
@@ -262,10 +261,3 @@ def test_cameras_are_listed_by_name(tmp_path: Path):
         (tmp_path / f"video{number}").mkdir()
         (tmp_path / f"video{number}" / "name").write_text(f"tip {number}\n")
     assert list(list_cameras(tmp_path).items()) == [("/dev/video2", "tip 2"), ("/dev/video10", "tip 10")]
-
-
-@pytest.fixture
-def unused_port() -> int:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return free.getsockname()[1]

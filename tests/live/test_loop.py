@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -23,12 +24,12 @@ from sliplens.recordings import ContactState, Dataset, Recording
 from sliplens.recordings.source import open_source
 
 
-def watch(read: Callable[[float], MarkerReading]) -> Callable[[np.ndarray], SimpleNamespace]:
+def watch(read: Callable[[float], MarkerReading]) -> Callable[[np.ndarray], Any]:
     """Make slip detectors that say of each time what they are given to say."""
     return lambda _: SimpleNamespace(update=lambda _, time_s: read(time_s))
 
 
-def judge(*checks: Callable[[LiveFrame], Check]) -> Callable[[np.ndarray], SimpleNamespace]:
+def judge(*checks: Callable[[LiveFrame], Check]) -> Callable[[np.ndarray], Any]:
     """Make monitors whose health is that of some checks."""
     return lambda _: SimpleNamespace(check=lambda frame, _: tuple(check(frame) for check in checks))
 
@@ -217,7 +218,7 @@ def test_a_slip_teaches_the_next_grasp_of_the_same_object_until_there_is_another
 ):
     trial = trials["chromatouch"]
     images = np.tile(trial.frames[10:15], (3, 1, 1, 1))
-    options = {"same_object": same_object, "sequence": sequence, "slip": watch(grasp), "engine": "torch"}
+    options = {"same_object": same_object, "sequence": sequence, "slip": watch(grasp)}
     reader = plain_reader(source := source_of(images), "chromatouch-difference", reference=trial.reference, **options)
 
     def hear(reading: Reading, _: object) -> None:

@@ -15,7 +15,7 @@ from sliplens.friction import FrictionLike, SlipLearner, as_friction
 from sliplens.images import require_rgb, soften
 from sliplens.live.contract import LiveOptions, LiveSource
 from sliplens.live.health import HealthMonitor, check_direction, check_novelty, margin_risk
-from sliplens.live.reading import OFF, Latency, LiveFrame, Reading, small_factor, small_picture
+from sliplens.live.reading import OFF, TARGET, Latency, LiveFrame, Reading, SlipState, small_picture
 from sliplens.live.slip import SlipDetector
 from sliplens.markers import Tracker
 from sliplens.models.checkpoint import Network
@@ -115,7 +115,8 @@ class FrameReader:
         self.learner: SlipLearner
         """Friction that was set, and that slips teach."""
         friction, sequence = settings.get("friction"), settings.get("sequence", False)
-        self.new_object(friction, same_object=settings.get("same_object", False))
+        self._same_object = settings.get("same_object", False)
+        self.new_object(friction)
         if sequence and network is None:
             raise InputError("--sequence needs a network; name one with --network")
         self._follower = network.follow(friction=friction) if network is not None and sequence else None
@@ -129,29 +130,26 @@ class FrameReader:
         self._last: Reading | None = None
         self._dropped = 0
 
-    def new_object(self, friction: FrictionLike | None = None, *, same_object: bool | None = None) -> None:
+    def new_object(self, friction: FrictionLike | None = None) -> None:
         """Begin another object: the friction that was set or learnt is dropped.
 
         Parameters
         ----------
         friction
             Friction of the new one, as `LiveReader` takes it; unknown if None.
-        same_object
-            As `LiveReader` takes it; as before if None.
 
         Raises
         ------
         InputError
             If the friction is none, or the network takes none.
         """
-        same_object = self.learner.same_object if same_object is None else same_object
-        if friction is not None or same_object:
+        if friction is not None or self._same_object:
             if self.network is None:
                 option = "--same-object" if friction is None else "--friction"
                 raise InputError(f"{option} needs a network; name one with --network")
             self.network.require_ratio()
         # a new one, not emptied: the reading thread may still teach the one before
-        self.learner = SlipLearner(None if friction is None else as_friction(friction), same_object=same_object)
+        self.learner = SlipLearner(None if friction is None else as_friction(friction), same_object=self._same_object)
 
     def begin(self, engine: Engine | None, reference: Frame | None, *, size: tuple[int, int] | None = None) -> None:
         """Prepare for frames of the open source, of its size if None, with an image of the untouched sensor if any."""
@@ -250,8 +248,7 @@ class FrameReader:
         if self._shear is not None and self.network is not None and all(check.ok for check in health):
             health = (*health, check_direction(self.network, self._shear.estimate(frame.image)))
         latency = replace(begin.latency, checks_ms=1e3 * (time.perf_counter() - begun))
-        withheld = next((check.sentence for check in health if not check.ok), None)
-        slip = markers and markers.state
+        withheld, slip = next((check.sentence for check in health if not check.ok), None), markers and markers.state
         reading = replace(begin, slip=slip, markers=markers, health=health, withheld=withheld, latency=latency)
         untouched = any(check.name == "touch" and not check.ok for check in health)
         touches = not untouched and (markers is None or markers.contact is not False)
@@ -286,9 +283,12 @@ class FrameReader:
         [state] = contact_states(values[:1], without=ContactState.UNKNOWN)
         margin, *ends = values.tolist()
         low, high = ends or (None, None)
+        slip = reading.slip
+        if slip is not None and slip is not SlipState.SLIP and high is not None and high < TARGET[0]:
+            slip = SlipState.WILL_SLIP
         return replace(
             reading,
-            slip=reading.slip and reading.slip.with_margin(high),
+            slip=slip,
             margin=margin,
             low=low,
             high=high,
@@ -316,11 +316,11 @@ class FrameReader:
         self.markers_px = None
         if self._make_slip is not None and self.reference is not None:
             try:
-                self._tracker, self._smaller = Tracker(self.reference), small_factor(self.reference.shape)
-                if self._smaller == 1 or self._tracker.rest.appearance.radius_px < _WIDE_PX * self._smaller:
-                    self._smaller = 1
-                else:  # a disc as wide as several pixels is measured as well in block means, in a third of the time
-                    self._tracker = Tracker(small_picture(self.reference))
+                self._tracker, self._smaller, small = Tracker(self.reference), 1, small_picture(self.reference)
+                factor = len(self.reference) // len(small)
+                # a disc as wide as several pixels is measured as well in block means, in a third of the time
+                if factor > 1 and self._tracker.rest.appearance.radius_px >= _WIDE_PX * factor:
+                    self._tracker, self._smaller = Tracker(small), factor
                 self._slip = self._make_slip(self._in_frame(self._tracker.rest.centre_px))
             except (ImageError, InputError):
                 self._tracker = self._slip = None  # it shows no markers, or too few

@@ -16,14 +16,9 @@ SmallPicture: TypeAlias = UInt8[np.ndarray, "rows columns 3"]
 _SMALL_PX = 224
 
 
-def small_factor(size: tuple[int, ...]) -> int:
-    """Return the factor by which `small_picture` reduces a frame of a size (height, width), in pixels."""
-    return max(1, min(size[:2]) // _SMALL_PX)
-
-
 def small_picture(image: Frame) -> SmallPicture:
     """Reduce a frame to 224 to 448 pixels by block means, so that limits in pixels suit every camera."""
-    return shrink(image, small_factor(image.shape))
+    return shrink(image, max(1, min(image.shape[:2]) // _SMALL_PX))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,11 +91,6 @@ class SlipState(StrEnum):
     WILL_SLIP = "will slip"
     """It does not slide, but its margin is below `TARGET`, with the whole interval."""
     CANNOT_TELL = "cannot tell"
-
-    def with_margin(self, high: float | None) -> "SlipState":
-        """Return the state given the upper end of the margin's interval."""
-        soon = high is not None and high < TARGET[0] and self is not SlipState.SLIP
-        return SlipState.WILL_SLIP if soon else self
 
 
 @dataclass(frozen=True, kw_only=True)
