@@ -52,9 +52,10 @@ def test_a_threshold_is_chosen_without_the_object_it_classifies():
     ("text", "words"),
     [
         ("file,object\na.mp4,cup", "needs the columns file and slips"),
-        ("file,slips\na.mp4,maybe\nb.mp4,1", "row 1: slips is 'maybe'"),
+        ("file,slips\na.mp4,maybe\nb.mp4,1", "line 2, 'slips' is 'maybe'"),
         ("file,slips\na.mp4,1\nb.mp4,1", "all labelled alike"),
-        ("file,slips,start_frame\na.mp4,1,soon\nb.mp4,0,2", "row 1: start_frame is 'soon'"),
+        ("file,slips,start_frame\na.mp4,1,soon\nb.mp4,0,2", "line 2, 'start_frame' is 'soon'"),
+        ("file,slips,start_frame\na.mp4,1,-1\nb.mp4,0,2", "count the frames from 0"),
     ],
 )
 def test_mistakes_of_the_table_are_named(tmp_path, text, words):

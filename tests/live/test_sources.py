@@ -86,11 +86,7 @@ def test_a_load_that_cannot_be_is_refused(load: tuple[float, float]):
     [
         ("nowhere.mp4", LiveOptions(), "nowhere.mp4 is no source that is known, nor a path that exists"),
         ("simulated", LiveOptions(speed=2.0), "a simulated chromatouch takes no --speed; leave it out"),
-        (
-            "simulated:thumb",
-            LiveOptions(),
-            "no simulated sensor named 'thumb'; choose one of chromatouch, flat-gel",
-        ),
+        ("simulated:thumb", LiveOptions(), "no simulated sensor named 'thumb'; choose one of chromatouch, flat-gel"),
         ("7", LiveOptions(speed=2.0), "the camera /dev/video7 takes no --speed; leave it out"),
         ("rtsp://10.0.0.1/", LiveOptions(trial="a"), "takes no --trial; leave it out"),
     ],

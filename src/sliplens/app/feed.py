@@ -237,7 +237,8 @@ class Feed:
                     self.map = self.explain(picture, LIVE_METHOD)
                 except (SliplensError, RuntimeError):
                     self.map = None
-                if is_first:  # what explainers import: to search it for garbage takes as long as some frames
+                # what explainers import: to search it for garbage takes as long as some frames
+                if is_first and self.map is not None:
                     gc.freeze()
             self._wake()
 

@@ -8,7 +8,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from contextlib import nullcontext, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Unpack
@@ -108,22 +108,20 @@ def view(
         capture = open_source(source, **source_options)[0]
     maps = load_explanation(Path(maps)) if isinstance(maps, Path | str) else maps
     failure = "the Rerun viewer was closed too early; leave it open"
-    with reporting(on_progress), open_stage(f"Reading {capture.trial}"):
-        address = start_viewer() if path is None else ""
-        with nullcontext() if path is None else written_whole(path) as part:
-            if part is None:
-                sink.stream.connect_grpc(address)
-            else:
-                part.touch()  # Rerun reports a file that cannot be written in its own way
-                failure = f"{path} could not be written; see what space is left"
-                sink.stream.save(part)
-            try:
-                _play(capture, sink, predictions=predictions, maps=maps, tracks=tracks)
-                sink.stream.flush()
-            except RuntimeError as error:
-                raise InputError(f"{failure} ({error})") from None
-            finally:
-                sink.stream.disconnect()
+    with reporting(on_progress), open_stage(f"Reading {capture.trial}"), ExitStack() as stack:
+        if path is None:
+            sink.stream.connect_grpc(start_viewer())
+        else:
+            failure = f"{path} could not be written; see what space is left"
+            part = stack.enter_context(written_whole(path))
+            part.touch()  # Rerun reports a file that cannot be written in its own way
+            sink.stream.save(part)
+        stack.callback(sink.stream.disconnect)
+        try:
+            _play(capture, sink, predictions=predictions, maps=maps, tracks=tracks)
+            sink.stream.flush()
+        except RuntimeError as error:
+            raise InputError(f"{failure} ({error})") from None
     return ViewedTrial(trial=capture.trial, frames=len(capture))
 
 
