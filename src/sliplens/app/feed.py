@@ -454,7 +454,7 @@ class Client:
             "controls": feed.controls,
             "points": points,  # readings since the message before
             "rate_hz": len(feed.points_since(now_s - _RATE_S)) / _RATE_S,
-            "waiting": self._waiting or (_STILL if reader.takes_reference else ""),
+            "waiting": self._waiting or (_STILL if reader.taker else ""),
             "notices": notices,
             "ended": feed.ended,
             "recording": recording,

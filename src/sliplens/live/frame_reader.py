@@ -126,7 +126,8 @@ class FrameReader:
         self._slip: SlipDetector | None = None
         self._tracker: Tracker | None = None
         self._smaller = 1
-        self._taker: ReferenceTaker | None = None
+        self.taker: ReferenceTaker | None = None
+        """Search for a new reference, until it is taken."""
         self._last: Reading | None = None
         self._dropped = 0
 
@@ -157,7 +158,7 @@ class FrameReader:
         if self._follower is not None and self.source.rate_hz:
             require_frequent(np.arange(2) * self.source.speed / self.source.rate_hz, what=self.source.name)
         if reference is None:
-            self._taker = ReferenceTaker()
+            self.taker = ReferenceTaker()
             return
         require_rgb(reference, what="levels of the reference")
         if reference.shape[:2] != self._size:
@@ -166,11 +167,6 @@ class FrameReader:
                 f"{_in_pixels(self._size)}; name an image of this camera with --reference, or leave it out"
             )
         self._set_reference(reference)
-
-    @property
-    def takes_reference(self) -> bool:
-        """True until a new reference was taken."""
-        return self._taker is not None
 
     def missing(self, why: str) -> Reading:
         """Make the reading of a moment without a frame."""
@@ -228,8 +224,8 @@ class FrameReader:
         if frame.size != self._size:
             sizes = f"{_in_pixels(frame.size)} pixels, they were {_in_pixels(self._size)}"
             return f"the frames of {name} are now {sizes}; set the camera as it was, or start again"
-        if (taker := self._taker) is not None and taker.offer(frame):
-            self._taker = None
+        if (taker := self.taker) is not None and taker.offer(frame):
+            self.taker = None
             self._set_reference(frame.image)
         if self.reference is None:
             return "there is no reference frame yet; the picture must be still for a moment: leave the sensor untouched"

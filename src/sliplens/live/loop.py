@@ -275,7 +275,7 @@ class LiveReader(FrameReader):
 
     def take_reference(self) -> None:
         """Take a new reference as soon as the picture is still; the old one holds until then."""
-        self._taker = ReferenceTaker()
+        self.taker = ReferenceTaker()
 
     def send_to(self, *sinks: str) -> None:
         """Send every reading and its frame to other programs from now on, until it is closed.
@@ -308,13 +308,10 @@ class LiveReader(FrameReader):
         trained = "" if self.network is None else self.network.manifest.sensor
         facts = replace(facts, sensor=facts.sensor or trained if profile is None else profile.name)
         recorder = Recorder(folder, facts=facts, source=self.source.name, simulated=self.source.simulated)
-        with ExitStack() as stack:
-            stack.callback(recorder.close)
-            if profile is not None:
-                save_profile(Path(folder), profile)
-            stack.pop_all()
         self.recorder = recorder
         self.outputs = (recorder, *(output for output in self.outputs if isinstance(output, Sender)))
+        if profile is not None:
+            save_profile(Path(folder), profile)
         return recorder
 
     def stop_recording(self) -> Dataset | None:

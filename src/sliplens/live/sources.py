@@ -185,34 +185,31 @@ class ReplaySource(LiveSource):
 
     def frames(self) -> Iterator[LiveFrame]:
         """Iterate over frames at their times."""
-        pace, capture, last_s, before = Pace(self.closed), self._capture, -np.inf, time.perf_counter()
+        pace, capture, before = Pace(self.closed), self._capture, time.perf_counter()
         margins = np.full(len(capture), np.nan) if capture.safety_margin is None else capture.safety_margin
+        forces, ends = capture.forces, np.zeros(len(capture) + 1, dtype=int)
+        if forces is not None:
+            forces = replace(forces, time_s=forces.time_s - self._first_s)
+            ends[1:] = np.searchsorted(forces.time_s, self._time_s, side="right")
         rows = zip(self._time_s.tolist(), margins.tolist(), capture.read_frames(), strict=False)
         for number, (time_s, margin, image) in enumerate(rows):  # a video whose header promised more ends before
             decode_ms = 1e3 * (time.perf_counter() - before)
             if not pace.wait(time_s / self.speed):
                 return
+            first, last = ends[number : number + 2].tolist()
+            since = None  # the frame before
+            if forces is not None and last > first:
+                since = replace(forces, time_s=forces.time_s[first:last], force_n=forces.force_n[first:last])
             yield LiveFrame(
                 image=image,
                 number=number,
                 time_s=time_s,
                 captured_s=time.monotonic(),
                 decode_ms=decode_ms,
-                forces=self._forces_between(last_s, time_s),
+                forces=since,
                 safety_margin=None if np.isnan(margin) else margin,
             )
-            last_s, before = time_s, time.perf_counter()
-
-    def _forces_between(self, after_s: float, until_s: float) -> Forces | None:
-        """Return the samples of the force sensor between two times."""
-        forces = self._capture.forces
-        if forces is None:
-            return None
-        all_s = forces.time_s - self._first_s
-        first, last = np.searchsorted(all_s, (after_s, until_s), side="right")
-        if first == last:
-            return None
-        return Forces(time_s=all_s[first:last], force_n=forces.force_n[first:last], source=forces.source)
+            before = time.perf_counter()
 
 
 _GRIP_N = 1.5
