@@ -186,9 +186,9 @@ class SlipBatch:
             del self._recoils_at[row]
             if not self._pressed[row] or time_s - began_s > 2 * _CONFIRMED_S:
                 continue
-            self._judged_s[row], seen = began_s, middle & newest.visible[row]
+            self._judged_s[row], both = began_s, middle & newest.visible[row]
             before_px = (first.moved[row] - hold)[:, middle].mean(axis=1)
-            after_px = (newest.moved[row] - hold)[:, seen].mean(axis=1) if seen.any() else np.zeros(2)
+            after_px = (newest.moved[row] - hold)[:, both].mean(axis=1) if both.any() else np.zeros(2)
             carried = float(after_px @ before_px) / max(float(before_px @ before_px), 1e-9)
             tightened = newest.spread[row] > _TIGHTENED * first.spread[row]
             if carried >= (_CARRIED_TIGHTENED if tightened else _CARRIED):
@@ -307,26 +307,26 @@ class SlipBatch:
         drop, wide = (np.take_along_axis(values, cut[:, None], axis=-1)[:, 0] for values in (drops_px, wide))
         whole = drop / wide / self._together_px[rows]
         for at in np.flatnonzero((drop >= _FALL * length) & (whole >= _RECOIL)).tolist():
-            row, seen, first = int(rows[at]), valid[at], len(frames) - int(self._window[rows[at]])
+            row, markers, first = int(rows[at]), valid[at], len(frames) - int(self._window[rows[at]])
             # means over the frames before the cut and after it
             halves = frames[first : cut[at] + 1], frames[cut[at] + 1 :]
             before, after = (np.mean([frame.moved[row] for frame in half], axis=0) for half in halves)
             bent, way = pattern[at], arm[at][::-1] * np.array([[-1.0], [1.0]])
-            bent = _without(bent[None], *(_unit(rigid[None]) for rigid in (*np.eye(2)[..., None] * seen, way)))[0]
+            bent = _without(bent[None], *(_unit(rigid[None]) for rigid in (*np.eye(2)[..., None] * markers, way)))[0]
             residual = np.linalg.norm(bent)
             bending = np.sum((before - after) * bent) / max(residual, 1e-9) / wide[at] / self._noise_px[row]
             # a large motion must show more than noise that happens to bend
             if bending < max(_EVIDENCE, _BENT_SHARE * residual * whole[at]):
                 continue
             # a contact that was let go, or pressed or pulled further, was handled
-            inner = seen & self._inner[row] if (seen & self._inner[row]).any() else seen
+            inner = markers & self._inner[row] if (markers & self._inner[row]).any() else markers
             from_px, to_px = (
                 np.linalg.norm((mean - self._hold[row])[:, inner].mean(axis=1)) for mean in (before, after)
             )
             loose, tight = (np.mean([frame.spread[row] for frame in half]) for half in halves)
             pressed_px = abs(loose - tight) / 2 * self._reach_px[row]
             is_pulled = to_px - from_px > _RECOIL * self._middle_noise_px()[row]
-            if not is_pulled and pressed_px <= drop[at] / np.sqrt(seen.sum()):
+            if not is_pulled and pressed_px <= drop[at] / np.sqrt(markers.sum()):
                 began_s[row] = frames[cut[at]].time_s
         return began_s
 
