@@ -16,6 +16,7 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from sliplens.app import LivePage, server
+from sliplens.live import LiveReader
 
 TOKEN = "a-token"
 COOKIE = {"Cookie": f"sliplens-8090={TOKEN}"}
@@ -110,7 +111,7 @@ def test_a_page_may_load_nothing_from_elsewhere_and_no_script_within_it_runs(hos
 )
 def test_others_need_a_token(host: str, own: bool):
     assert server.is_loopback(host) is own
-    assert (LivePage(Mock(), host=host).token is None) is own
+    assert (LivePage(Mock(spec=LiveReader), host=host).token is None) is own
 
 
 # what anybody can send
@@ -132,7 +133,7 @@ def port(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Ite
 
     monkeypatch.setattr(LivePage, "_talk", talk)
     monkeypatch.setattr(server, "Feed", Mock())
-    page = LivePage(Mock(), port=0)
+    page = LivePage(Mock(spec=LiveReader), port=0)
     page.token = request.param
     with page:
         yield page._socket.getsockname()[1]
