@@ -3,12 +3,9 @@
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from command_line import typed
 
-from sliplens.errors import InputError
 from sliplens.recordings import Dataset
 
 rerun = pytest.importorskip("rerun")
@@ -33,23 +30,6 @@ def test_the_first_trial_is_written_unless_another_is_named(small_dataset: Datas
         assert name_of(output) == small_dataset.trials[trial].trial
         assert f"rerun {output}" in capsys.readouterr().out.replace("\n", "")
     assert len(list(tmp_path.iterdir())) == 2
-
-
-def test_a_table_of_predictions_finds_its_frames(small_dataset: Dataset, tmp_path: Path):
-    rows = {"trial": ["test-wet-7"], "frame": [3], "prediction": [0.5], "low_90": [0.4], "high_90": [0.6]}
-    table, output = tmp_path / "margins.parquet", tmp_path / "a.rrd"
-    for source in (str(small_dataset.folder), str(tmp_path / "gone"), ""):
-        pq.write_table(pa.table(rows).replace_schema_metadata({"sliplens.source": source}), table)
-        if source == str(small_dataset.folder):
-            typed("view", table, "-o", output)
-            assert name_of(output) == "test-wet-7"
-            continue
-        with pytest.raises(
-            InputError, match=r"which does not exist; name the source first, and the table with --predic"
-        ):
-            typed("view", table, "-o", tmp_path / "b.rrd")
-    words = ("--trial", "test-wet-7", "--predictions", table, "-o", tmp_path / "b.rrd")
-    typed("view", small_dataset.folder, *words)
 
 
 def test_without_an_output_the_viewer_opens(small_dataset: Dataset, monkeypatch: pytest.MonkeyPatch, tmp_path, capsys):

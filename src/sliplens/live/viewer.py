@@ -9,7 +9,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -27,8 +27,7 @@ from sliplens.plots.style import written_whole
 from sliplens.progress import OnProgress, open_stage, report_each, reporting
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.source import SourceOptions, open_source
-from sliplens.recordings.trial import labels_of_margins
-from sliplens.results.explanation import Explanation, is_explanation, load_explanation
+from sliplens.results.explanation import Explanation, load_explanation
 
 _ARROWS = [(240, 228, 66)]
 _HALF_PX = 0.5  # a pixel's centre is a whole number here, and a half more in Rerun
@@ -43,7 +42,7 @@ class ViewedTrial(Result):
 
 
 def view(
-    source: Path | str | Explanation,
+    source: Path | str,
     *,
     predictions: Path | str | None = None,
     maps: Path | str | Explanation | None = None,
@@ -60,7 +59,7 @@ def view(
     Parameters
     ----------
     source
-        Any source of `open_source`, a table of `predict` (which names its source), or maps of `explain`.
+        Any source of `open_source`.
     predictions
         Margins with their intervals, as `predict` or `evaluate` wrote them (Parquet).
     maps
@@ -92,20 +91,7 @@ def view(
     if path is not None:
         require_new_file(path, suffix=".rrd", overwrite=overwrite)
     sink = RerunSink(lossless=True)
-    if isinstance(source, Path | str):
-        source = Path(source)
-        if source.suffix == ".parquet":
-            predictions = source
-            source, first = _source_of(source)
-            source_options.setdefault("trial", first)
-        elif is_explanation(source):
-            source = load_explanation(source)
-    if isinstance(source, Explanation):
-        maps, labels = source, labels_of_margins(np.array([frame.safety_margin for frame in source.frames], float))
-        files = tuple(f"{frame.id}.png" for frame in source.frames)
-        capture = replace(open_source(source.pictures)[0], trial=source.frames[0].trial, labels=labels, files=files)
-    else:
-        capture = open_source(source, **source_options)[0]
+    capture = open_source(source, **source_options)[0]
     maps = load_explanation(Path(maps)) if isinstance(maps, Path | str) else maps
     failure = "the Rerun viewer was closed too early; leave it open"
     with reporting(on_progress), open_stage(f"Reading {capture.trial}"), ExitStack() as stack:
@@ -167,19 +153,6 @@ def _play(
                 stream.log(f"map/{method}", rerun.Clear(recursive=False))
 
 
-def _source_of(table: Path) -> tuple[Path, str | None]:
-    """Return the source of a table of predictions, and its first trial."""
-    with open_parquet(table, {"trial": "texts"}, cure="name a table that sliplens predict wrote") as file:
-        source = (file.schema_arrow.metadata or {}).get(b"sliplens.source", b"").decode()
-        trials = next(file.iter_batches(1, columns=["trial"]), None)
-    if not source or not Path(source).exists():
-        raise InputError(
-            f"{table} was predicted from {source or 'an unknown source'}, which does not exist; name the source first, "
-            f"and the table with --predictions {table}"
-        )
-    return Path(source), None if trials is None else trials["trial"][0].as_py()
-
-
 def _rows_of(capture: Capture, path: Path, columns: Sequence[str], *, command: str) -> np.ndarray:
     """Load the numbers of the frames of a trial and some columns, (rows, 1 + columns); NaN where there is none."""
     kinds: dict[str, Any] = dict.fromkeys(columns, "numbers") | {"trial": "texts", "frame": "whole numbers"}
@@ -199,7 +172,6 @@ def _rows_of(capture: Capture, path: Path, columns: Sequence[str], *, command: s
 def _rows_of_maps(capture: Capture, maps: Explanation) -> dict[int, int]:
     """Return the rows of the maps by the numbers of the trial's frames."""
     numbers = {f"{capture.trial}-f{number:04d}": number for number in range(len(capture))}
-    # names of files go first: of maps alone the files are the frames that were explained
     numbers |= {Path(name).stem: number for number, name in enumerate(capture.files or ())}
     rows = {numbers[frame.id]: row for row, frame in enumerate(maps.frames) if frame.id in numbers}
     if not rows:

@@ -204,12 +204,6 @@ def require_saliency(
     return saliency
 
 
-def is_explanation(folder: Path) -> bool:
-    """Return True if `sliplens explain` wrote the folder."""
-    path = folder / RUN_FILE
-    return path.is_file() and load_record(path, Provenance, command="sliplens explain").stage == "explain"
-
-
 def load_explanation(folder: Path) -> Explanation:
     """Read a folder that `sliplens explain` wrote.
 
@@ -220,7 +214,8 @@ def load_explanation(folder: Path) -> Explanation:
         finite.
     """
     require_folder(folder, what="the explanations")
-    if not is_explanation(folder):
+    path = folder / RUN_FILE
+    if not (path.is_file() and load_record(path, Provenance, command="sliplens explain").stage == "explain"):
         raise InputError(f"{folder} holds no explanations; make them with sliplens explain")
     return load_result(folder, Explanation, command="sliplens explain")
 
