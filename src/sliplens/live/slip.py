@@ -135,7 +135,10 @@ class SlipBatch:
         stand_out = moved[:, 0] ** 2 + moved[:, 1] ** 2 > ((2 * _RAYLEIGH_95 * self._noise_px) ** 2)[:, None]
         # out of the noise, and a contact that was there has not been let go
         contact = ready & (np.count_nonzero(stand_out, axis=1) > 0.1 * count) & (spread > _LET_GO * self._pressed)
-        self._end(np.flatnonzero(~contact & (self._pressed > 0)))
+        ends = ~contact & (self._pressed > 0)
+        self._hold[ends] = self._pattern[ends] = self._slip_s[ends] = np.nan
+        self._pressed[ends] = self._hold_s[ends] = self._recoil_s[ends] = 0.0
+        self._inner[ends], self._least_px[ends] = False, np.inf
         shear_px = np.linalg.norm(self._shear(moved, visible), axis=1)
         # what is stuck, and the shear, count from a press that grew by much, and more than it was pulled: a pull, too,
         # spreads the markers a little
@@ -223,11 +226,6 @@ class SlipBatch:
         rank = rank_from_centre(self._rest[rows].swapaxes(1, 2), mean_px=mean_px, divergence=spread)
         inner = (rank < INNER_SHARE) & visible
         self._inner[rows] = np.where((inner.sum(axis=1) >= 2)[:, None], inner, visible)
-
-    def _end(self, rows: Rows) -> None:
-        self._hold[rows] = self._pattern[rows] = self._slip_s[rows] = np.nan
-        self._pressed[rows] = self._hold_s[rows] = self._recoil_s[rows] = 0.0
-        self._inner[rows], self._least_px[rows] = False, np.inf
 
     def stick_share(self, row: int) -> float:
         """Compute the share of a contact's markers that move with its middle, in the newest frame."""
