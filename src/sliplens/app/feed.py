@@ -98,10 +98,9 @@ class Map(msgspec.Struct, frozen=True, kw_only=True):
     method: str
     baseline: int | None
     """Frame with which it is compared, the last before the pull; None for the untouched sensor."""
-    prediction: float
     baseline_prediction: float
-    rows: int
-    columns: int
+    shape: tuple[int, ...]
+    """Number of rows and columns."""
     full: float
     """Relevance of a cell of 127."""
     alike: bool
@@ -262,10 +261,8 @@ class Feed:
             number=frame.number,
             method=method,  # tiles where no markers are found
             baseline=None if start is None else start.number,
-            prediction=explained.prediction,
             baseline_prediction=explained.reference_prediction,
-            rows=relevance.shape[0],
-            columns=relevance.shape[1],
+            shape=relevance.shape,
             full=full,
             alike=alike,
             warnings=(*warnings, *(text.partition("): ")[2] for text in explanation.methods[method].warnings)),

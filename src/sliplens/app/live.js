@@ -94,7 +94,7 @@ function show() {
   send({ act: "show", map: $.map.checked });
 }
 
-function paintMap({ rows, columns }, cells) {
+function paintMap({ shape: [rows, columns] }, cells) {
   const canvas = new OffscreenCanvas(columns, rows), context = canvas.getContext("2d");
   const pixels = context.createImageData(columns, rows);
   cells.forEach((cell, index) => {
