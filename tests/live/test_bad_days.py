@@ -204,29 +204,24 @@ def test_a_camera_keeps_the_stamps_of_the_kernel_and_counts_what_is_lost(camera:
     assert [frame.captured_s for frame in frames] == pytest.approx([now_s, now_s + 0.06])
 
 
+@pytest.mark.parametrize("mjpg", [True, False])
 @pytest.mark.parametrize(
     ("options", "asked", "size"),
     [
-        (LiveOptions(), {"input_format": "mjpeg"}, (48, 64)),
+        (LiveOptions(), {}, (48, 64)),
         (LiveOptions(size=(24, 32), rate_hz=50.0), {"video_size": "32x24", "framerate": "50"}, (24, 32)),  # scaled down
         (LiveOptions(fit_size=(24, 32)), {"video_size": "32x24"}, (24, 32)),
         (LiveOptions(fit_size=(224, 224)), {"video_size": "224x224"}, (48, 64)),  # of another shape
     ],
 )
 def test_a_camera_is_asked_for_what_the_options_say(
-    camera: FakeCamera, options: LiveOptions, asked: dict[str, str], size: tuple[int, int]
+    camera: FakeCamera, options: LiveOptions, asked: dict[str, str], size: tuple[int, int], mjpg: bool
 ):
-    camera.formats |= {"yuyv422"}
+    camera.formats = {"mjpeg", "yuyv422"} if mjpg else {"yuyv422"}
     with open_live("/dev/video0", options=options) as source:
         assert source.size == size
         assert next(iter(source.frames())).image.shape == (*size, 3)
-    assert camera.asked == [{"input_format": "mjpeg"} | asked]
-
-
-def test_a_camera_without_mjpg_is_read_as_it_is(camera: FakeCamera):
-    camera.formats = {"yuyv422"}
-    with open_live("0"):
-        assert camera.asked == [{"input_format": "mjpeg"}, {}]
+    assert camera.asked == [{"input_format": "mjpeg"} | asked, *([] if mjpg else [asked])]
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from scripted import Scripted, frames_of, plain_reader, source_of
+from there import there
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import sliplens as sl
@@ -156,21 +157,16 @@ def test_every_margin_has_the_novelty_of_its_very_frame(trials: dict[str, Record
 
 def test_markers_are_followed_for_whoever_tells_slip(trials: dict[str, Recording]):
     trial, source = trials["chromatouch"], source_of(trials["chromatouch"].frames[:1])
-    reader = plain_reader(
-        source, reference=trial.reference, slip=watch(lambda _: MarkerReading(state=SlipState.STICKING))
-    )
+    reader = plain_reader(source, reference=trial.reference, slip=watch(grasp))
     assert [reading.slip for reading in source.all_readings(reader)] == [SlipState.STICKING]
-    assert trial.truth is not None
-    assert reader.markers_px is not None
     # markers of the untouched sensor, seen within a pixel
-    nearest = np.linalg.norm(trial.truth.marker_px[0][:, None] - reader.markers_px[1][None], axis=-1).min(axis=0)
-    assert np.nanmax(nearest) < 1
+    between = there(trial.truth).marker_px[0][:, None] - there(reader.markers_px)[1][None]
+    assert np.nanmax(np.linalg.norm(between, axis=-1).min(axis=0)) < 1
 
 
 @pytest.mark.parametrize("named", [False, True])
 def test_without_a_contact_there_is_no_margin(trials: dict[str, Recording], named: bool):
     trial = trials["chromatouch"]
-
     touched = watch(lambda time_s: MarkerReading(state=SlipState.CANNOT_TELL, contact=time_s > 0))
     source, network = source_of(trial.frames[:2]), "chromatouch-difference" if named else None
     first, second = source.all_readings(network, reference=trial.reference, slip=touched)
@@ -185,10 +181,7 @@ def test_what_is_told_of_friction_shapes_the_margin_and_a_slip_narrows_it(
     trials: dict[str, Recording], ratio_run: Path
 ):
     trial, network = trials["chromatouch"], sl.load(ratio_run)
-
-    slips = watch(
-        lambda time_s: MarkerReading(state=SlipState.STICKING, contact=True, slipped_s=0.06 if time_s > 0.12 else None)
-    )
+    slips = watch(lambda time_s: grasp(0.15 if time_s > 0.12 else 0.0))
     told, source = sl.Friction.between(0.3, 0.9), source_of(trial.frames[10:14])
     readings = source.all_readings(network, reference=trial.reference, friction=told, slip=slips)
     estimates = [network.estimate(network.encode(frame[None], trial.reference)) for frame in trial.frames[10:14]]
@@ -223,7 +216,7 @@ def test_a_slip_teaches_the_next_grasp_of_the_same_object_until_there_is_another
 
     def hear(reading: Reading, _: object) -> None:
         if reading.number == 9:
-            assert reader.learnt is not None
+            there(reader.learnt)
             reader.new_object()
             assert reader.learnt is None
 
@@ -261,11 +254,9 @@ def test_markers_of_a_large_frame_are_told_in_its_own_pixels(trials: dict[str, R
     source = source_of(np.stack([large[1]]))
     reader = sl.LiveReader(source, reference=large[0], stall_s=10.0)
     source.all_readings(reader)
-    assert reader.markers_px is not None
     tracker = Tracker(large[0])  # in the frame itself
-    for told, known in zip(
-        reader.markers_px, (tracker.rest.centre_px, tracker.update(large[1]).position_px), strict=True
-    ):
+    expected = tracker.rest.centre_px, tracker.update(large[1]).position_px
+    for told, known in zip(there(reader.markers_px), expected, strict=True):
         distance = np.linalg.norm(told[:, None] - known[None], axis=-1)
         distance = np.nanmin(np.where(np.isnan(distance), np.inf, distance), axis=1)
         assert np.mean(distance < 0.2) > 0.9  # those at the edge may be seen in one and cut in the other
