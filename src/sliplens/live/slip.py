@@ -144,11 +144,15 @@ class SlipBatch:
         # spreads the markers a little
         grown_px = (spread - self._pressed) / 2 * self._reach_px
         pressed = (spread > _REPRESSED * self._pressed) & (grown_px > np.nan_to_num(shear_px))
-        begins = np.flatnonzero(contact & pressed)
-        if len(begins):
-            self._begin(begins, moved[begins], spread[begins], time_s)
-            shear_px[begins] = 0.0
-        self._window = np.where(contact, self._window + 1, 0)
+        self._window = np.where(contact & ~pressed, self._window, 0) + contact
+        if len(rows := np.flatnonzero(contact & pressed)):
+            self._hold[rows] = np.where(visible[rows, None], moved[rows], np.nan)
+            self._pressed[rows], self._hold_s[rows] = spread[rows], time_s
+            self._pattern[rows], shear_px[rows] = np.nan, 0.0
+            mean_px = (self._fit[rows, :1] * moved[rows]).sum(axis=2)
+            rank = rank_from_centre(self._rest[rows].swapaxes(1, 2), mean_px=mean_px, divergence=spread[rows])
+            inner = (rank < INNER_SHARE) & visible[rows]
+            self._inner[rows] = np.where((inner.sum(axis=1) >= 2)[:, None], inner, visible[rows])
         self._frames.append(_Frame(time_s, spread, moved, visible))
         self._shorten_windows(time_s)
         began_s = self._recoils()
@@ -215,17 +219,6 @@ class SlipBatch:
         )
         self._noise_px, self._together_px = single, np.maximum(single, together)
         self._still.clear()
-
-    def _begin(self, rows: Rows, moved: Fields, spread: Float[np.ndarray, " begins"], time_s: float) -> None:
-        """Begin some contacts, or begin them anew."""
-        visible = self._visible[rows]
-        self._hold[rows] = np.where(visible[:, None], moved, np.nan)
-        self._pressed[rows], self._hold_s[rows] = spread, time_s
-        self._pattern[rows], self._window[rows] = np.nan, 0
-        mean_px = (self._fit[rows, :1] * moved).sum(axis=2)
-        rank = rank_from_centre(self._rest[rows].swapaxes(1, 2), mean_px=mean_px, divergence=spread)
-        inner = (rank < INNER_SHARE) & visible
-        self._inner[rows] = np.where((inner.sum(axis=1) >= 2)[:, None], inner, visible)
 
     def stick_share(self, row: int) -> float:
         """Compute the share of a contact's markers that move with its middle, in the newest frame."""
