@@ -65,21 +65,18 @@ class LiveSource(ABC):
     """True where no real sensor is behind it."""
     reconnects: bool = False
     """True where it may come back after a `SourceError`."""
+    _stack = ExitStack()
 
     @cached_property
     def closed(self) -> Event:
         """Event that `close` sets, and entering the source clears."""
         return Event()
 
-    @cached_property
-    def _stack(self) -> ExitStack:
-        return ExitStack()
-
     def __enter__(self) -> "LiveSource":
         self.closed.clear()
         with ExitStack() as stack:
             self.open(stack)
-            self._stack.enter_context(stack.pop_all())
+            self._stack = stack.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
