@@ -11,7 +11,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from scripted import frame_of
+from scripted import frame_of, plain_reader
 from there import there
 
 pytest.importorskip("websockets", reason="the page needs websockets (extra live)")
@@ -148,7 +148,7 @@ def test_its_threads_have_ended_when_it_is_closed():
     async def run() -> list[str]:
         source = SimulatedSource(rate_hz=200.0)
         source.load(normal_force_n=4.0, tangential_force_n=1.0)
-        with sl.LiveReader(source, "chromatouch-difference", engine="torch", health=None, slip=None) as reader:
+        with plain_reader(source, "chromatouch-difference") as reader:
             feed = Feed(reader)
             feed.clients.add(Mock(wants_picture=True, shows_map=True, ready=True))
             before = set(threading.enumerate())

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 from hostile_names import FILE_NAME, assert_inert, watch
+from scripted import plain_reader
 
-import sliplens as sl
 from sliplens.app import LivePage
 from sliplens.errors import InputError
 from sliplens.grip.source import GripSource
@@ -27,11 +27,8 @@ CAPTION = "document.querySelector('#caption').textContent"
 def served(source: LiveSource, network: str | None, into: Path, *, markers: bool = False) -> Iterator[LivePage]:
     """Serve the page of a source."""
     # a busy machine drops frames, and health and markers would withhold margins for that
-    slip = SlipDetector if markers else None
-    with (
-        sl.LiveReader(source, network, engine="torch", health=None, slip=slip) as reader,
-        LivePage(reader, port=0, record_into=into) as page,
-    ):
+    reader = plain_reader(source, network, slip=SlipDetector if markers else None)
+    with reader, LivePage(reader, port=0, record_into=into) as page:
         yield page
 
 

@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 from PIL import Image
 from rrd import read_rrd, shown
+from scripted import plain_reader, source_of
 from zenoh_router import open_router
 
-import sliplens as sl
 from sliplens.errors import InputError
-from sliplens.live import ReplaySource
 from sliplens.live.reading import Reading
 from sliplens.live.sinks import (
     IMAGE_TOPIC,
@@ -28,7 +27,6 @@ from sliplens.live.sinks import (
     open_sink,
     reading_schema,
 )
-from sliplens.recordings.source import open_source
 
 READING = Reading(number=7, time_s=0.5, captured_s=100.25, margin=0.4, low=0.3, high=0.55)
 IMAGE = np.full((8, 12, 3), (200, 100, 50), dtype=np.uint8)
@@ -166,8 +164,7 @@ def test_a_sink_that_hangs_is_left_after_a_while(slow: Slow):
 def test_a_sink_that_breaks_off_says_so_and_the_reading_goes_on(slow: Slow):
     frames = np.full((6, 8, 8, 3), 128, dtype=np.uint8)
     slow.go.set()
-    source = ReplaySource(open_source(frames)[0], rate_hz=500.0)
-    reader = sl.LiveReader(source, reference=frames[0], health=None, slip=None)
+    reader = plain_reader(source_of(frames, patient=False), reference=frames[0])
     reader.send_to("slow")
     [sender] = reader.outputs
     sender.put((replace(READING, number=99), None))
