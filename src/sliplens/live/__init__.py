@@ -7,18 +7,10 @@ from sliplens.live.mailbox import Outlet
 from sliplens.live.reading import Check, Latency, LiveFrame, MarkerReading, Reading, SlipState
 from sliplens.live.recorder import ForceStream, Recorder
 from sliplens.live.slip import SlipDetector
-from sliplens.live.sources import (
-    SOURCES,
-    CameraSource,
-    ReplaySource,
-    SimulatedSource,
-    list_cameras,
-    open_live,
-)
+from sliplens.live.sources import SOURCES, CameraSource, ReplaySource, SimulatedSource, list_cameras, open_live
 
 __all__ = [
-    "SOURCES", "CameraSource", "Check", "ForceStream", "HealthMonitor",
-    "Latency", "LiveFrame", "LiveOptions", "LiveReader", "LiveSource", "MarkerReading", "Outlet", "Reading",
-    "Recorder", "ReplaySource", "SimulatedSource", "SlipDetector", "SlipState", "SourceKind",
-    "list_cameras", "open_live", "read_live",
+    "SOURCES", "CameraSource", "Check", "ForceStream", "HealthMonitor", "Latency", "LiveFrame", "LiveOptions",
+    "LiveReader", "LiveSource", "MarkerReading", "Outlet", "Reading", "Recorder", "ReplaySource", "SimulatedSource",
+    "SlipDetector", "SlipState", "SourceKind", "list_cameras", "open_live", "read_live",
 ]  # fmt: skip
