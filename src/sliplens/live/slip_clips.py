@@ -84,7 +84,7 @@ def evaluate_slip(table: Path | str, *, after: int | None = None, markers: str =
         raise InputError(f"{table} needs the columns file and slips; it has {', '.join(text.header)}")
     lines = [(line, dict(zip(text.header, cells, strict=True))) for line, cells in text.rows]
     numbers = {
-        name: np.array([to_number(row[name], path=path, line=line, column=name) for line, row in lines])
+        name: np.array([to_number(row[name], table=text, line=line, column=name) for line, row in lines])
         for name in (label, "start_frame", "width")
         if name in text.header
     }
