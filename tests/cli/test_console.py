@@ -21,18 +21,20 @@ def screen(monkeypatch: pytest.MonkeyPatch) -> Console:
     return narrow
 
 
-def test_wide_table_fits_80_columns_with_every_word_whole(screen: Console) -> None:
-    numbers = [[name, *(f"0.123 (0.045 to 0.{index}78)" for index in range(5))] for name in METHODS]
-
-    print_table("Scores of explanations", [dict(zip(HEAD, row, strict=True)) for row in numbers])
-
-    text = screen.export_text()
-    assert max(map(len, text.splitlines())) <= 80
-    for row in numbers:
-        for cell in row[1:]:
-            assert text.count(cell) == 3, "a number is broken or missing"
-    for word in " ".join((*METHODS, *HEAD)).split():
-        assert word in text
+@pytest.mark.parametrize("width", [60, 70, 80, 90, 100, 110, 140])
+def test_a_table_fits_the_terminal_with_every_word_whole(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    screen = Console(width=width, record=True)
+    monkeypatch.setattr(console, "OUT", screen)
+    for count, cell in ((5, "0.123 (0.045 to 0.{}78)"), (3, "2133 ms {}/21")):
+        rows = [
+            dict(zip(HEAD, [name, *(cell.format(index) for index in range(count))], strict=False)) for name in METHODS
+        ]
+        print_table("Scores of explanations", rows)
+        text = screen.export_text()
+        assert max(map(len, text.splitlines())) <= width
+        for row in rows:
+            assert all(text.count(cell) == 3 for cell in list(row.values())[1:]), "a number is broken or missing"
+        assert all(word in text for word in " ".join((*METHODS, *rows[0])).split())
 
 
 def test_numbers_stand_to_the_right_and_words_to_the_left(screen: Console) -> None:

@@ -11,7 +11,6 @@ from rich import progress as rich_progress
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
-from rich.text import Text
 
 from sliplens.progress import OnProgress, fold_equal, visible
 
@@ -107,12 +106,11 @@ def print_table(title: str, rows: Sequence[Mapping[str, str | int | None]]) -> N
         columns |= {visible(name): list(words)} if any(cell is not None for cell in cells) else {}
     widest = 1
     for place, (name, cells) in enumerate(columns.items()):
-        words = name.split() if place else " ".join([name, *cells]).split()  # only the names of rows may be broken
-        widest += 3 + max(map(len, [*words, *(cells if place else [])]))
+        widest += 3 + max(map(len, [name, *cells]))
         numbers = place and any(re.match(r"[-+]?\d", cell) for cell in cells)
-        table.add_column(escape(name), justify="right" if numbers else "left", no_wrap=place > 0 and " " not in name)
-    for first, *cells in zip(*columns.values(), strict=True):
-        table.add_row(escape(first), *(Text(cell, no_wrap=True) for cell in cells))
+        table.add_column(escape(name), justify="right" if numbers else "left", no_wrap=True)
+    for cells in zip(*columns.values(), strict=True):
+        table.add_row(*map(escape, cells))
     if widest <= OUT.width:
         OUT.print(table)
         return

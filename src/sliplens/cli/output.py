@@ -169,12 +169,12 @@ def print_scores(evaluation: "Evaluation") -> None:
                 "MSE": f"{scores.mse:.4f}",
                 "R2": "none" if scores.r2 is None else f"{scores.r2:.3f}",
                 "MAE": f"{scores.mae:.3f}",
-                "in 90 %": _percent(evaluation.coverage[name].get("0.9")),
-                "warns before": lead.median_ms and f"{lead.median_ms:.0f} ms {lead.warned}/{lead.trials}",
-                "false/min": f"{lead.false_per_minute:.1f}",
+                "90 %": _percent(evaluation.coverage[name].get("0.9")),
+                "warns": lead.median_ms and f"{lead.median_ms / 1e3:.2f} s {lead.warned}/{lead.trials}",
+                "false": f"{lead.false_per_minute:.1f}/min",
             }
         )
-    print_table(f"{evaluation.input} images, {evaluation.split} trials", rows)
+    print_table(f"{evaluation.input} images, {evaluation.split} trials; 90 %: labels within this interval", rows)
     if evaluation.friction:
         say(f"friction: {evaluation.friction}")
     if evaluation.sequence:
