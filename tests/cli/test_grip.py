@@ -11,17 +11,7 @@ from sliplens.grip.records import Grip
 
 
 def test_many_episodes_make_a_record_and_a_picture_and_are_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    words = (
-        "grip",
-        "-o",
-        tmp_path,
-        "--controller",
-        "fixed",
-        "--episodes",
-        4,
-        "--set",
-        "force_n=3.5",
-    )
+    words = ("grip", "-o", tmp_path, "--controller", "fixed", "--episodes", 4, "--set", "force_n=3.5")
     assert run(*words) == 0
     told = capsys.readouterr().out
     assert "0 of 4" in told

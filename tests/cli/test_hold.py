@@ -11,17 +11,8 @@ from sliplens.recordings import Dataset
 
 
 def test_a_line_of_json_a_command_and_a_table_of_all(small_dataset: Dataset, tmp_path: Path, capsys):
-    words = (
-        "hold",
-        small_dataset.folder,
-        "--gripper",
-        "dry-run",
-        "--controller",
-        "fixed",
-        "--set",
-        "force_n=9",
-        "--json",
-    )
+    fixed = ("--controller", "fixed", "--set", "force_n=9")
+    words = ("hold", small_dataset.folder, "--gripper", "dry-run", *fixed, "--json")
     assert run(*words, "--ceiling", "3.5", "-o", tmp_path / "held") == 0
     captured = capsys.readouterr()
     steps = [json.loads(line) for line in captured.out.splitlines() if line.startswith("{")]
