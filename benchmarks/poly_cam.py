@@ -54,7 +54,7 @@ def pick_inputs(trained: Network, data: Dataset, *, count: int) -> tuple[Tensor,
 def plain_loop(network: str, pixels: np.ndarray, untouched: np.ndarray, passes: int) -> float:
     """Return the seconds of a loop of one masked image at a time over all channels."""
     model, image, reference = load(Path(network)).model, torch.from_numpy(pixels), torch.from_numpy(untouched)
-    names = [layer.name for layer in find_layers(model, image[None])]
+    names = list(find_layers(model, image[None]))
     with capture(model, names) as outputs:
         model(image[None])
     masks = [to_masks(outputs[name][0]) for name in names]

@@ -16,10 +16,10 @@ from sliplens.explainers.poly_cam import PolyCam
 def test_equals_the_derivation_one_mask_at_a_time(name, count, network, images, monkeypatch):
     reference, size = images[2], 32 if name == "mobilenet" else 64
     model, images, reference = network(name), images[..., :size, :size], reference[..., :size, :size]
-    layers = find_layers(model, images)[:count]
+    layers = dict(list(find_layers(model, images).items())[:count])
     monkeypatch.setattr("sliplens.explainers.poly_cam.find_layers", lambda *_: layers)
     explanation = PolyCam()(model, images[:1], reference=reference)
-    saliency = by_hand(model, images[0], reference, layers=tuple(layer.name for layer in layers))
+    saliency = by_hand(model, images[0], reference, layers=tuple(layers))
     expected = saliency / saliency.sum() * float(explanation.change[0])
     assert expected.any()
     np.testing.assert_allclose(explanation.relevance[0], expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
@@ -64,7 +64,7 @@ def test_layers_finer_than_the_level_cost_nothing(network, images):
     passes = count_passes(model)
     PolyCam(level=2)(model, images[:1])
     passed = sum(passes)  # before the next search for layers; some channels are constant
-    assert passed <= PREPARATION + 2 * sum(layer.shape[0] for layer in find_layers(model, images)[2:])
+    assert passed <= PREPARATION + 2 * sum(shape[0] for shape in list(find_layers(model, images).values())[2:])
 
 
 def test_constant_channels_cost_no_pass(network, images, monkeypatch):
@@ -72,11 +72,11 @@ def test_constant_channels_cost_no_pass(network, images, monkeypatch):
     with torch.no_grad():
         model.conv1[1].weight[:3] = 0  # after its ReLU a channel is a constant
         model.conv1[1].bias[:3] = torch.tensor([0.5, 0, -1])
-    layers = find_layers(model, images[:1])
-    monkeypatch.setattr("sliplens.explainers.poly_cam.find_layers", lambda *_: layers[:1])
+    (name, shape), *_ = find_layers(model, images[:1]).items()
+    monkeypatch.setattr("sliplens.explainers.poly_cam.find_layers", lambda *_: {name: shape})
     passes = count_passes(model)
     PolyCam()(model, images[:1])
-    assert sum(passes) == PREPARATION - 1 + 2 * (layers[0].shape[0] - 3)
+    assert sum(passes) == PREPARATION - 1 + 2 * (shape[0] - 3)
 
 
 class Sums(nn.Module):

@@ -21,8 +21,8 @@ def test_finds_the_ten_layers_of_the_public_code():
     # at 64 px the maps of TorchVision's ShuffleNetV2 shrink where they shrink at 224 px
     model = models.shufflenet_v2_x1_0(weights=None)
     layers = find_published_layers(model, torch.zeros(1, 3, 64, 64))
-    assert [layer.name for layer in layers] == PUBLISHED[:-1]  # all but the last stage
-    assert sum(layer.shape[0] for layer in layers) == 1208
+    assert list(layers) == PUBLISHED[:-1]  # all but the last stage
+    assert sum(shape[0] for shape in layers.values()) == 1208
 
 
 def test_a_network_that_keeps_its_size_has_no_such_layer():
@@ -40,7 +40,7 @@ def test_equals_the_public_code(level, network, images, monkeypatch):
         model.fc.weight.mul_(0.05)
     expected = by_hand(model, images[0], torch.zeros_like(images[0]), layers=layers[level:], published=True)
     expected = torch.from_numpy(expected / expected.max()).float()
-    chosen = [next(layer for layer in find_layers(model, images) if layer.name == name) for name in layers]
+    chosen = {name: find_layers(model, images)[name] for name in layers}
     monkeypatch.setattr("sliplens.explainers.poly_cam.find_published_layers", lambda *_: chosen)
     explanation = PolyCam(published=True, level=level)(model, images[:1], reference=images[1])
     torch.testing.assert_close(saliency(explanation)[0], expected, atol=1e-5, rtol=0)

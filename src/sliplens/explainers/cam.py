@@ -42,15 +42,6 @@ Shape: TypeAlias = tuple[int, int, int]
 """Channels, rows and columns of a map."""
 
 
-class Layer(NamedTuple):
-    """A module whose output is a map."""
-
-    name: str
-    """Its name in `model.named_modules()`."""
-    shape: Shape
-    """Channels, rows and columns of the map."""
-
-
 class _Call(NamedTuple):
     """One call of a module, with the calls made inside it in the order in which they ran."""
 
@@ -61,20 +52,21 @@ class _Call(NamedTuple):
     inner: "list[_Call]"
 
 
-def find_layers(model: nn.Module, images: Float[Tensor, "batch colours height width"]) -> tuple[Layer, ...]:
+def find_layers(model: nn.Module, images: Float[Tensor, "batch colours height width"]) -> dict[str, Shape]:
     """Find the layers to explain, in the order in which they run: fine to coarse in the usual network.
 
-    The network is run once, with one image, and its main path followed, not into blocks and their branches but into
-    plain `Sequential` containers, wrappers whose output is no map, and blocks that shrink the map by more than two.
-    Each resolution and width gives its last map; layers without parameters (pooling) and 1 x 1 maps are left out. For
-    TorchVision's ShuffleNetV2 these are conv1, stage2, stage3, stage4 and conv5.
+    Names are those of `model.named_modules()`. The network is run once, with one image, and its main path followed, not
+    into blocks and their branches but into plain `Sequential` containers, wrappers whose output is no map, and blocks
+    that shrink the map by more than two. Each resolution and width gives its last map; layers without parameters
+    (pooling) and 1 x 1 maps are left out. For TorchVision's ShuffleNetV2 these are conv1, stage2, stage3, stage4 and
+    conv5.
 
     Raises
     ------
     ModelError
         If the network has no layer with a map, or maps with the channels last, such as a Swin transformer.
     """
-    path, layers = _main_path(_record(model, images)), []
+    path, layers = _main_path(_record(model, images)), dict[str, Shape]()
     if any(_is_channels_last(step) for step in path):
         raise ModelError(
             f"{type(model).__name__} has maps with their channels last, which methods of the CAM family do not take; "
@@ -84,16 +76,16 @@ def find_layers(model: nn.Module, images: Float[Tensor, "batch colours height wi
         members = list(group)
         has_parameters = any(next(step.module.parameters(), None) is not None for step in members)
         if shape is not None and shape[1] * shape[2] > 1 and has_parameters:
-            layers.append(Layer(members[-1].name, shape))
+            layers[members[-1].name] = shape
     if not layers:
         raise ModelError(
             f"{type(model).__name__} has no layer with a spatial map for images of {images.shape[-2]} x "
             f"{images.shape[-1]} pixels; use larger images, a convolutional network, or integrated gradients"
         )
-    return tuple(layers)
+    return layers
 
 
-def find_published_layers(model: nn.Module, images: Float[Tensor, "batch colours height width"]) -> tuple[Layer, ...]:
+def find_published_layers(model: nn.Module, images: Float[Tensor, "batch colours height width"]) -> dict[str, Shape]:
     """Find the layers of the public code: every module that ends just before the size of the output changes.
 
     Modules are listed as they end, insides before their block: the size goes down and up again inside a block with two
@@ -102,14 +94,14 @@ def find_published_layers(model: nn.Module, images: Float[Tensor, "batch colours
     Public code of Poly-CAM, `find_layer_list`.
     """
     ended = [(call.name, call.output_shape) for call in _finished(_record(model, images))]
-    layers: dict[str, Layer] = {}
+    layers: dict[str, Shape] = {}
     for (name, shape), (_, following) in pairwise(ended):
         if shape is None and following is None:
             continue
         if shape is None or following is None:
             break  # the public code stops at what flattens
         if following[1:] != shape[1:]:
-            layers[name] = Layer(name, shape)
+            layers[name] = shape
             if following[1:] == (1, 1):
                 break
     if not layers:
@@ -117,7 +109,7 @@ def find_published_layers(model: nn.Module, images: Float[Tensor, "batch colours
             f"{type(model).__name__} has no layer where the size of the map changes, which poly-cam-thesis looks for; "
             "use poly-cam"
         )
-    return tuple(layers.values())
+    return layers
 
 
 def _record(model: nn.Module, images: Tensor) -> _Call:
@@ -206,7 +198,7 @@ class GradCam(Method):
 
     def _explain(self, comparison: Comparison) -> Attribution:
         try:
-            layer = find_layers(comparison.model, comparison.images)[-1]
+            *_, layer = find_layers(comparison.model, comparison.images)
         except ModelError:
             _ = comparison.change  # a model that gives no number has a greater fault than one without layers
             raise
@@ -217,12 +209,12 @@ class GradCam(Method):
         pairs = list(zip(parts, references, strict=True))
         for images, empty in report_each(pairs, sizes=[len(images) for images, _ in pairs]):
             # images and references in one pass
-            with capture(comparison.model, [layer.name], differentiable=True) as outputs:
+            with capture(comparison.model, [layer], differentiable=True) as outputs:
                 both = comparison.predict(torch.cat([images, empty]))
             if not both.requires_grad:
-                raise ModelError(f"the output of {type(comparison.model).__name__} does not depend on {layer.name!r}")
-            (gradients,) = torch.autograd.grad(both[: len(images)].sum(), outputs[layer.name])
-            activations, base = outputs[layer.name].detach().tensor_split([len(images)])
+                raise ModelError(f"the output of {type(comparison.model).__name__} does not depend on {layer!r}")
+            (gradients,) = torch.autograd.grad(both[: len(images)].sum(), outputs[layer])
+            activations, base = outputs[layer].detach().tensor_split([len(images)])
             prediction, low = both.detach().tensor_split([len(images)])
             contrast = activations if self.published else activations - base
             cells = self.cells(contrast, gradients[: len(images)])
@@ -235,7 +227,7 @@ class GradCam(Method):
         return comparison.attribution(
             relevance,
             complete=not self.published,
-            target=f"{'f(x)' if self.published else 'f(x) - f(reference)'}, through layer {layer.name}",
+            target=f"{'f(x)' if self.published else 'f(x) - f(reference)'}, through layer {layer}",
             warnings=comparison.saturated(relevance.abs().sum(dim=(1, 2)).tolist()),
             raises_only=self.published,
         )

@@ -156,8 +156,8 @@ class PolyCam(Method):
         layers = (find_published_layers if self.published else find_layers)(comparison.model, comparison.images)
         if not 0 <= self.level < len(layers):
             raise InputError(f"Poly-CAM has no level {self.level} for {len(layers)} layers; count from 0, the finest")
-        layers = layers[self.level :]  # a level is made of its own layer and the coarser ones
-        names, channels = [layer.name for layer in layers], sum(layer.shape[0] for layer in layers)
+        names = list(layers)[self.level :]  # a level is made of its own layer and the coarser ones
+        channels = sum(layers[name][0] for name in names)
         # one engine for all rounds and images
         passes = len(comparison.images) * round(self.budget * channels) * _PASSES
         engine = comparison.prepare(passes, engine=self.engine)

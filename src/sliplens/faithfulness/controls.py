@@ -146,7 +146,7 @@ def relative_change(images: Images, references: Images) -> ControlMaps:
 @torch.no_grad()
 def even_channels(model: nn.Module, images: Images, references: Images) -> ControlMaps:
     """Compute Poly-CAM's map with every channel's weight 1, whatever its effect on the prediction."""
-    names, size = [layer.name for layer in find_layers(model, images)], (images.shape[-2], images.shape[-1])
+    names, size = list(find_layers(model, images)), (images.shape[-2], images.shape[-1])
     with capture(model, names) as outputs:
         model(images)
     maps = []
