@@ -8,24 +8,30 @@ from sliplens.explainers.cam import capture, find_layers
 from sliplens.models import build_model
 
 LAYERS = {
-    "shufflenet_v2_x1_0": "conv1 24 112, stage2 116 28, stage3 232 14, stage4 464 7, conv5 1024 7",
-    "resnet18": "relu 64 112, layer1 64 56, layer2 128 28, layer3 256 14, layer4 512 7",
+    "shufflenet_v2_x1_0": (
+        ["conv1", *(f"stage{n}" for n in (2, 3, 4)), "conv5"],
+        [24, 116, 232, 464, 1024],
+        [112, 28, 14, 7, 7],
+    ),
+    "resnet18": (["relu", "layer1", "layer2", "layer3", "layer4"], [64, 64, 128, 256, 512], [112, 56, 28, 14, 7]),
     "mobilenet_v3_small": (
-        "features.0 16 112, features.1 16 56, features.3 24 28, features.6 40 14, features.8 48 14, features.11 96 7, "
-        "features 576 7"
+        [*(f"features.{number}" for number in (0, 1, 3, 6, 8, 11)), "features"],
+        [16, 16, 24, 40, 48, 96, 576],
+        [112, 56, 28, 14, 14, 7, 7],
     ),
     # the last map before each pooling
-    "vgg11": "features.1 64 224, features.4 128 112, features.9 256 56, features.14 512 28, features.19 512 14",
+    "vgg11": ([f"features.{number}" for number in (1, 4, 9, 14, 19)], [64, 128, 256, 512, 512], [224, 112, 56, 28, 14]),
 }
-"""Layers of TorchVision's networks: name, channels and side of the map."""
+"""Layers of TorchVision's networks: names, channels and sides of the maps."""
 
 
 @pytest.mark.parametrize("name", LAYERS)
 def test_finds_the_last_map_of_each_resolution_and_width(name):
     with torch.device("meta"):  # shapes without arithmetic
         layers = find_layers(getattr(models, name)(weights=None), torch.zeros(1, 3, 224, 224))
-    assert ", ".join(f"{layer} {shape[0]} {shape[1]}" for layer, shape in layers.items()) == LAYERS[name]
-    assert all(height == width for _, height, width in layers.values())
+    names, channels, sides = LAYERS[name]
+    assert list(layers) == names
+    assert list(layers.values()) == list(zip(channels, sides, sides, strict=True))
 
 
 def test_finds_layers_before_functional_pooling(network, images):
