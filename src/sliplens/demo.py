@@ -1,18 +1,20 @@
 """A first look: a simulated grip, predicted, explained and proved, on one page that grows while the rest is made."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from sliplens.errors import InputError
 from sliplens.explainers.table import RECOMMENDED_METHOD
+from sliplens.files import DIFFERENCE_NETWORK
 from sliplens.models.checkpoint import load
 from sliplens.progress import OnProgress, open_stage, reporting
 from sliplens.recordings import Dataset
 from sliplens.report import write_report
 from sliplens.results.explanation import Strip
 from sliplens.simulation.trials import simulate
-from sliplens.study.explaining import make_strip
+from sliplens.study.explaining import explain, make_strip
 from sliplens.study.stages import keep_record
 from sliplens.training import evaluate
 
@@ -42,7 +44,8 @@ def run_demo(
 
     The page is written as soon as the first grip is explained, and again after each further stage. It says whether
     such maps can be trusted, by the study that comes with the package, and proves one of them: the simulator moves the
-    markers that it ranks first. After an interruption the same call continues.
+    markers that it ranks first. It explains real frames too, where the public ChromaTouch images are in the folder that
+    `SLIPLENS_REFERENCE` names. After an interruption the same call continues.
 
     Parameters
     ----------
@@ -67,6 +70,8 @@ def run_demo(
     PosixPath('runs/demo/report.html')
     """
     folder = Path(out)
+    reference = Path(os.environ.get("SLIPLENS_REFERENCE", "../shared/reference"))
+    images, real_title = reference / "chromatouch" / "difference", "what a network predicts from real frames"
     names = [path.name for path in folder.iterdir() if path.name[0] != "."] if folder.is_dir() else []
     if (folder.exists() and not folder.is_dir()) or (names and "data" not in names):
         raise InputError(f"{folder} exists and is no demo; choose another folder")
@@ -81,9 +86,14 @@ def run_demo(
     data = simulate(folder / "data", on_progress=on_progress, **SHOWN_DATA)
     with reporting(on_progress):
         _make_strip(folder / "strip", data, NETWORKS["difference"])
-    show("how well both networks predict")
+    show("how well both networks predict", *([real_title] if images.is_dir() else []))
     for name, network in NETWORKS.items():
         evaluate(network, data, folder / f"evaluate-{name}", on_progress=on_progress)
+    if images.is_dir():
+        show(real_title)
+        # the networks of the thesis are for one simulated sensor
+        real = folder / "explain-real"
+        explain(DIFFERENCE_NETWORK, images, method="occlusion", labels_in_names=True, out=real, on_progress=on_progress)
     return show()
 
 
