@@ -62,11 +62,14 @@ def test_a_package_that_imports_sliplens_first_can_add_to_it(install):
     assert Table("fill", "sliplens.other", {})["other"] is FILLS["grey"]
 
 
-def test_a_row_that_cannot_be_imported_names_its_package(install):
+def test_a_row_that_cannot_be_imported_is_left_out_and_names_its_package(install):
     install("sliplens.levels", "other = other_rows:MISSING")
-    table = Table("level", "sliplens.levels", {})
-    with pytest.raises(InputError, match=r"other-rows adds the level 'other', .* update or uninstall other-rows"):
-        list(table)
+    table, words = Table("level", "sliplens.levels", {"black": 0.0}), r"other-rows adds the level 'other', .* update or"
+    with pytest.warns(UserWarning, match=words):
+        assert list(table) == ["black"]
+    assert table.pick("black") == 0.0
+    with pytest.raises(InputError, match=words):
+        table.pick("other")
 
 
 def test_no_package_replaces_a_row_of_sliplens(install):

@@ -161,3 +161,19 @@ def test_the_pages_of_the_interface_describe_every_name_of_the_package():
     listed = re.findall(r"^\| \{py:\w+\}`~sliplens\.(\w+)`", API_PAGE, flags=re.MULTILINE)
     modules = {module.__name__.removeprefix("sliplens.") for module in MODULES}
     assert sorted(set(described) - modules) == sorted(listed) == sorted(set(sliplens.__all__) - {"__version__"})
+
+
+CALLS = [name for name in sliplens.__all__ if inspect.isfunction(getattr(sliplens, name))]
+
+
+@pytest.mark.parametrize("name", [*CALLS, "LiveReader", "StudyConfig"])
+def test_a_misspelt_keyword_is_refused_before_anything_else(name):
+    call = getattr(sliplens, name)
+    parameters = inspect.signature(call).parameters.values()
+    required = [each.name for each in parameters if each.default is each.empty and each.kind is not each.VAR_KEYWORD]
+    options = [each.annotation for each in parameters if each.kind is each.VAR_KEYWORD]
+    # of `**options: Unpack[TypedDict]` Python itself accepts any keyword
+    known = [next(iter(typing.get_args(annotation)[0].__annotations__)) for annotation in options]
+    for wrong, words in [("nosuch", "nosuch"), *((f"{option}s", f"did you mean '{option}'") for option in known)]:
+        with pytest.raises(TypeError, match=words):
+            next(iter(call(**dict.fromkeys(required, Path("nothing")), **{wrong: 1})))

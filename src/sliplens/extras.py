@@ -2,12 +2,15 @@
 
 import os
 import sys
-from collections.abc import Iterator, Mapping
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from difflib import get_close_matches
 from functools import cached_property
 from importlib import import_module, metadata
 from importlib.util import find_spec
+from inspect import signature
 from types import ModuleType
-from typing import TypeVar
+from typing import Any, TypeVar, get_args
 
 from sliplens.errors import InputError
 
@@ -18,8 +21,9 @@ class Table(Mapping[str, Row]):
     """Rows by name: those of sliplens, then those that installed packages add through an entry point.
 
     A package names its rows in its metadata: `[project.entry-points."sliplens.fills"]`, `my-fill = "package:row"`. They
-    are imported when the table is walked or a name is not one of ours: a package may import sliplens first. No package
-    replaces a row of sliplens. Messages call a row by the `noun`.
+    are imported when the table is walked or a name is not one of ours: a package may import sliplens first. One that
+    cannot be imported is left out with a warning, and `pick` of its name raises the error. No package replaces a row of
+    sliplens. Messages call a row by the `noun`.
 
     Examples
     --------
@@ -36,6 +40,7 @@ class Table(Mapping[str, Row]):
     def __init__(self, noun: str, group: str, rows: Mapping[str, Row]) -> None:
         self.noun, self.group = noun, group
         self._rows = dict(rows)
+        self._broken: dict[str, InputError] = {}
 
     def __getitem__(self, name: str) -> Row:
         return self._rows[name] if name in self._rows else self._added[name]
@@ -49,6 +54,8 @@ class Table(Mapping[str, Row]):
 
     def pick(self, name: str) -> Row:
         """Row of a name that a user gave."""
+        if name not in self and name in self._broken:
+            raise self._broken[name]
         return pick(self, name, noun=self.noun)
 
     @cached_property
@@ -62,9 +69,9 @@ class Table(Mapping[str, Row]):
             try:
                 rows[point.name] = point.load()
             except Exception as error:  # whatever another package's import may raise
-                raise InputError(
-                    f"{adds}, but {point.value} cannot be imported ({error}); update or uninstall {package}"
-                ) from error
+                reason = f"{adds}, but {point.value} cannot be imported ({error}); update or uninstall {package}"
+                self._broken[point.name] = InputError(reason)
+                warnings.warn(reason, stacklevel=2)
         return rows
 
 
@@ -73,6 +80,20 @@ def pick(rows: Mapping[str, Row], name: str, *, noun: str) -> Row:
     if name not in rows:
         raise InputError(f"there is no {noun} named {name!r}; choose one of {', '.join(rows)}")
     return rows[name]
+
+
+def require_keywords(call: Callable[..., Any], given: Iterable[str]) -> None:
+    """Raise a TypeError for a keyword that a call with `**options: Unpack[TypedDict]` does not take.
+
+    Python itself accepts any keyword there.
+    """
+    *named, options = signature(call).parameters.values()
+    accepted = get_args(options.annotation)[0].__annotations__
+    for name in given:
+        if name not in accepted:
+            near = get_close_matches(name, [*accepted, *(parameter.name for parameter in named)], n=1)
+            cure = f"did you mean {near[0]!r}?" if near else f"it takes {', '.join(accepted)}"
+            raise TypeError(f"{call.__name__}() has no parameter {name!r}; {cure}")
 
 
 ONNX_PACKAGES = ("onnx", "onnxscript", "onnxruntime")  #: Packages of the extra `onnx`.

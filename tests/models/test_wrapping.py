@@ -116,6 +116,7 @@ def test_maps_of_captum_are_scored_with_controls(frames: np.ndarray):
     images = images_of(frames).requires_grad_()
     maps = DeepLift(module).attribute(images, baselines=torch.zeros_like(images)).sum(dim=1)
     score = sl.score(network, frames, maps.detach().numpy(), random_orders=2)
+    assert sl.score(network, torch.from_numpy(frames), maps, random_orders=2).scores == score.scores
     assert score.score("maps").srg.estimate > 0
     assert any(each.control for each in score.scores)
 
@@ -156,9 +157,13 @@ def test_a_module_goes_in_without_wrapping():
         (small_module(), {"size": 32}, "size="),
         (small_module(2), {"output": 5}, "size=|output="),
         (small_module(), {"encoding": "rgbd"}, "rgb"),
+        (Returning(small_module(2), lambda values: {"fx": values}), {"output": "fy"}, r"KeyError: 'fy'.*output="),
+        (small_module(), {"size": (SIZE, SIZE)}, "size="),
+        (small_module(), {"preprocess": "imagenet"}, "preprocess="),
+        (small_module().state_dict(), {}, "load_state_dict"),
     ],
 )
-def test_what_cannot_be_wrapped_is_refused_with_its_cure(module: nn.Module, options: dict, cure: str):
+def test_what_cannot_be_wrapped_is_refused_with_its_cure(module: object, options: dict, cure: str):
     with pytest.raises(SliplensError, match=cure):
         sl.wrap(module, **{"size": SIZE, **options})
 
@@ -175,5 +180,8 @@ def test_an_explanation_names_the_weights_of_its_module(frames: np.ndarray):
     explanation = sl.explain(sl.wrap(small_module(), size=SIZE), frames, method="integrated-gradients")
     with pytest.raises(SliplensError, match="another network"):
         sl.score(sl.wrap(small_module(seed=1), size=SIZE), explanation)
+    outputs = [sl.wrap(small_module(3), size=SIZE, output=output) for output in (0, 2)]
+    with pytest.raises(SliplensError, match="another network"):
+        sl.score(outputs[0], sl.explain(outputs[1], frames, method="integrated-gradients"))
     same = sl.wrap(small_module(), size=SIZE)
     assert sl.score(replace(same), explanation, random_orders=1, steps=0).frames == len(frames)

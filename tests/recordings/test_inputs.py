@@ -59,15 +59,19 @@ REFUSED: dict[str, Callable[[np.ndarray], object]] = {
 def test_predict_and_explain_see_the_same_frames(kind: str, frames: np.ndarray, tmp_path: Path):
     source = TAKEN[kind](frames, tmp_path)
     expected, predicted = (
-        sl.predict(NETWORK, images, reference=frames[1]).to_arrow()["prediction"].to_numpy()
-        for images in (frames, source)
+        sl.predict(NETWORK, images, reference=reference).to_arrow()["prediction"].to_numpy()
+        for images, reference in ((frames, frames[1]), (source, torch.tensor(frames[1])))
     )
     np.testing.assert_allclose(predicted, expected if len(predicted) == 3 else expected[1:2], atol=1e-5)
     finite = np.isfinite(predicted)  # the untouched frame at least; noise is withheld
     assert finite.any()
-    explanation = sl.explain(NETWORK, source, reference=frames[1], method="grad-cam", baseline="untouched")
+    explanation = sl.explain(NETWORK, source, reference=frames[1], method="grad-cam", baseline=torch.tensor(frames[1]))
     explained = [frame.prediction for frame in explanation.frames]
     np.testing.assert_allclose(np.array(explained)[finite], predicted[finite], atol=1e-5)
+    withheld = [frame.id for frame in explanation.frames if frame.withheld is not None]
+    warnings = [text for text in explanation.methods["grad-cam"].warnings if "the prediction is withheld" in text]
+    assert len(warnings) == bool(withheld)
+    assert all(name in warnings[0] for name in withheld)
 
 
 @pytest.mark.parametrize("call", [sl.predict, sl.explain])
@@ -102,3 +106,9 @@ def test_damaged_arrays_are_refused(tmp_path: Path, frames: np.ndarray, suffix: 
     path.write_bytes(data)
     with pytest.raises(InputError, match="cannot be read as a NumPy array"):
         open_source(path)
+
+
+def test_frames_without_a_contact_have_no_margin_in_the_summary(frames: np.ndarray):
+    dark = np.zeros_like(frames)
+    assert "nothing touches the sensor" in sl.predict(NETWORK, dark, reference=dark[0]).summary
+    assert "median" in sl.predict(NETWORK, frames, reference=frames[1]).summary

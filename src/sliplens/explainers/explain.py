@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
-from sliplens.errors import InputError, SliplensError
-from sliplens.explainers.attribution import frame_of
+from sliplens.errors import InputError, ModelError, SliplensError
+from sliplens.explainers.attribution import Attribution, frame_of
 from sliplens.explainers.contract import Explainer
 from sliplens.explainers.frames import ChosenFrames, FindMarkers
 from sliplens.explainers.occlusion import KnownMarkers, RegionMethod, find_markers
@@ -65,8 +65,8 @@ def choose_explainers(
     def find() -> Sequence[Float[Tensor, "_markers 2"]]:
         if chosen.find_markers is None:
             raise InputError(
-                "markers do not show in difference images; give camera frames with the untouched sensor as reference "
-                "(--reference), or a data set"
+                "methods by marker need camera frames with the untouched sensor as reference (--reference), or a data "
+                "set: difference images and networks without a reference show no markers"
             )
         return chosen.find_markers()
 
@@ -113,6 +113,9 @@ def explain_rows(
         # one reference for all where it is the same, so that it is predicted once
         shared = references[0] if bool((references == references[:1]).all()) else references
         attribution = explainer(network.model, inputs, reference=shared)
+    if not isinstance(attribution, Attribution):
+        name = getattr(explainer, "method", type(explainer).__name__)
+        raise ModelError(f"the explainer {name} returned a {type(attribution).__name__}; it must return an Attribution")
     relevance = attribution.relevance.cpu().numpy()
     for row, values in zip(rows, relevance, strict=True):
         require_saliency(values, inputs.shape[-2:], where=f"the map of {chosen.ids[row]} by {attribution.method}")
@@ -150,6 +153,7 @@ def join_maps(
     # predicted once for all methods, on all frames
     estimate, compared = network.estimate(normalised.to(network.device)), network.predict(references).tolist()
     withheld = estimate.withheld(np.ones(len(normalised), dtype=bool))  # all are taken for touches
+    reasons = dict(zip(chosen.ids, withheld, strict=True))
     return Explanation(
         input=network.encoding.name,
         source=chosen.source,
@@ -169,7 +173,7 @@ def join_maps(
             )
             for index, margin in enumerate(chosen.safety_margin)
         ),
-        methods={method: _notes(pieces, chosen.ids, (*chosen.warnings, *warnings)) for method, pieces in maps.items()},
+        methods={method: _notes(pieces, reasons, (*chosen.warnings, *warnings)) for method, pieces in maps.items()},
         images=chosen.images.numpy(),
         references=chosen.references.numpy(),
         pictures=(255 * frame_of(normalised).permute(0, 2, 3, 1)).round().to(torch.uint8).contiguous().numpy(),
@@ -182,9 +186,15 @@ _MOST_NAMES = 3
 """Frames that a warning names."""
 
 
-def _notes(pieces: Sequence[MethodMaps], ids: Sequence[str], warnings: Sequence[str]) -> MethodNotes:
-    """Join what is known of a method's maps; a warning of several frames is written once, with their names."""
-    frames_of: dict[str, list[str]] = {}
+def _notes(pieces: Sequence[MethodMaps], withheld: Mapping[str, str | None], warnings: Sequence[str]) -> MethodNotes:
+    """Join what is known of a method's maps; a warning of several frames is written once, with their names.
+
+    `withheld`: why the prediction of each frame, by its name, is not reliable; None where it is.
+    """
+    frames_of, ids = dict[str, list[str]](), list(withheld)
+    for name, reason in withheld.items():
+        if reason is not None:
+            frames_of.setdefault(f"the prediction is withheld: {reason}", []).append(name)
     first = 0
     for piece in pieces:
         names = ids[first : first + len(piece.relevance)]

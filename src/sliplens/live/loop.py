@@ -15,7 +15,7 @@ import torch
 from threadpoolctl import threadpool_limits
 
 from sliplens.errors import InputError, RecordingError, SourceError
-from sliplens.extras import import_cv2, missing_packages
+from sliplens.extras import import_cv2, missing_packages, require_keywords
 from sliplens.friction import Friction
 from sliplens.images import read_image
 from sliplens.live.contract import LiveOptions, LiveSource
@@ -126,8 +126,7 @@ class LiveReader(FrameReader):
         network: Network | Path | str | None = None,
         **settings: Unpack[ReaderSettings],
     ) -> None:
-        if unknown := settings.keys() - ReaderSettings.__annotations__.keys():
-            raise TypeError(f"LiveReader takes no {', '.join(sorted(unknown))}")
+        require_keywords(LiveReader, settings)
         self._seconds = settings.get("seconds")
         if self._seconds is not None and not self._seconds > 0:
             raise InputError(f"--seconds must be positive, got {self._seconds:g}")

@@ -19,6 +19,7 @@ import pyarrow.compute as pc
 
 from sliplens.codec import Result, open_parquet
 from sliplens.errors import InputError
+from sliplens.extras import require_keywords
 from sliplens.files import require_new_file
 from sliplens.live.reading import Reading
 from sliplens.live.sinks import RerunSink
@@ -87,6 +88,7 @@ def view(
     >>> import sliplens as sl
     >>> sl.view("data", out="trial.rrd")  # doctest: +SKIP
     """
+    require_keywords(view, source_options)
     path = None if out is None else Path(out)
     if path is not None:
         require_new_file(path, suffix=".rrd", overwrite=overwrite)

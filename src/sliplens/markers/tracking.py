@@ -11,7 +11,7 @@ import pyarrow as pa
 from sliplens._version import __version__
 from sliplens.codec import Result, read_written, regrouped, write_tables
 from sliplens.errors import InputError
-from sliplens.extras import import_cv2, pick
+from sliplens.extras import import_cv2, pick, require_keywords
 from sliplens.images import Images
 from sliplens.markers.detect import KINDS
 from sliplens.markers.tracker import MarkerStatus, Tracker
@@ -132,6 +132,7 @@ def track(
     >>> list(table.columns)[:4]  # doctest: +SKIP
     ['trial', 'frame', 'time_s', 'marker']
     """
+    require_keywords(track, source_options)
     path = None if out is None else Path(out)
     if path is not None and path.suffix:
         require_new_table(path, suffix=".parquet", overwrite=overwrite)

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from sliplens._version import __version__
 from sliplens.codec import TABLE_SUFFIXES, Result, read_written, write_tables
 from sliplens.errors import InputError
+from sliplens.extras import require_keywords
 from sliplens.files import DEFAULT_NETWORK, DIFFERENCE_NETWORK, hash_json
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.images import LEAST_TOUCH, Images, picture_change, soften
@@ -96,8 +97,11 @@ class Predictions(Result):
     @property
     def summary(self) -> str:
         """Margins in a sentence."""
-        margin = 100 * self.to_arrow()["prediction"].drop_null().to_numpy()
+        rows = self.to_arrow()
+        margin = 100 * rows["prediction"].drop_null().to_numpy()
         words = f"{number_of(self.frames, 'frame')} by {self.engine}"
+        if "touches" in rows.column_names and not rows["touches"].to_numpy().any():
+            return f"{words}, nothing touches the sensor in any of them: there is no margin"
         if len(margin):
             lowest, highest = f"{margin.min():.0f}", f"{margin.max():.0f}"
             words += f", safety margin {np.median(margin):.0f} % (median), from {lowest} to {highest} %"
@@ -208,6 +212,7 @@ def predict(
     >>> list(predictions.frame().columns)[:4]
     ['trial', 'frame', 'time_s', 'prediction']
     """
+    require_keywords(predict, options)
     on = options.pop("on", "serial")
     preprocess = options.pop("preprocess", None)
     source_options: SourceOptions = {**options}  # pyright: ignore[reportAssignmentType]

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from sliplens.errors import InputError, ModelError
 from sliplens.extras import pick
+from sliplens.files import hash_json
 from sliplens.models.checkpoint import Manifest, Network, hash_weights, load
 from sliplens.models.encodings import ENCODINGS
 
@@ -104,6 +105,9 @@ def wrap(
     >>> sl.explain(network, frames, method="integrated-gradients").relevance["integrated-gradients"].shape
     (2, 32, 32)
     """
+    if not isinstance(module, nn.Module):
+        kind = type(module).__name__
+        raise ModelError(f"a {kind} is no module; build the torch.nn.Module, and load its weights with load_state_dict")
     trains = [type(part).__name__ for part in module.modules() if part.training and isinstance(part, _NEEDS_EVAL)]
     if trains:
         raise ModelError(
@@ -117,8 +121,9 @@ def wrap(
             model(torch.zeros(2, row.colours, size, size, device=device))
     except Exception as error:  # whatever a module of others raises
         raise ModelError(
-            f"the module does not run on images of shape (2, {row.colours}, {size}, {size}): {error}; set size=, or "
-            "preprocess= for what it needs before it"
+            f"the module does not run on images of shape (2, {row.colours}, {size}, {size}) "
+            f"({type(error).__name__}: {error}); set size= to a number of pixels, preprocess= to a "
+            "function, or output= to an output that it has"
         ) from error
     return Network(
         model=model,
@@ -132,7 +137,8 @@ def wrap(
             head="module",
             target="output",
             unit=unit,
-            weights_sha256=hash_weights(module),
+            # networks of one module with other outputs are different networks
+            weights_sha256=hash_json([hash_weights(module), getattr(output, "__qualname__", output)]),
         ),
     )
 

@@ -16,6 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from sliplens.codec import RESULT_FILE, load_record
 from sliplens.errors import InputError, PartError, RecordingError, SliplensError
+from sliplens.extras import require_keywords
 from sliplens.files import output_folder, remove, whole_file, write_json
 from sliplens.images import Soft, require_rgb, soften
 from sliplens.progress import OnProgress, add_note, number_of, open_stage, report_each, report_progress, reporting
@@ -292,6 +293,7 @@ def import_recordings(
     >>> data.trials[0].trial  # doctest: +SKIP
     'cup'
     """
+    require_keywords(import_recordings, options)
     require_executor(on)
     paths = [Path(source) for source in ([sources] if isinstance(sources, Path | str) else sources)]
     reading, labelling = reading or ReadOptions(), labelling or LabelSettings()

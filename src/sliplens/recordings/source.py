@@ -149,8 +149,8 @@ class Trials:
         """Options of the source as JSON holds them; an image by its hash."""
         image = self.options.get("reference")
         if image is not None:
-            pixels = isinstance(image, np.ndarray)
-            image = hashlib.sha256(image.tobytes()).hexdigest() if pixels else hash_file(Path(image))
+            is_file = isinstance(image, Path | str)
+            image = hash_file(Path(image)) if is_file else hashlib.sha256(as_frames(image).tobytes()).hexdigest()
         return {**self.options, "reference": image}
 
     def reader(self) -> Callable[[str, int, int], tuple[Capture, Iterator[tuple[int, Frame]]]]:

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Int
 
 from sliplens._version import __version__
 from sliplens.errors import InputError
+from sliplens.extras import require_keywords
 from sliplens.files import output_folder, scratch_folder
 from sliplens.progress import OnProgress, number_of, open_stage, report_each, report_file, reporting
 from sliplens.recordings import Dataset, GroundTruth, Recording
@@ -118,6 +119,7 @@ def simulate(
     >>> len(data.trials), data.trials[0].split
     (3, 'train')
     """
+    require_keywords(simulate, changes)
     recipe = make_recipe(preset, sensor=sensor, **changes)
     with reporting(on_progress), ExitStack() as stack:
         if out is None:

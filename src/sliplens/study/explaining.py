@@ -17,6 +17,7 @@ from sliplens.explainers.explain import MethodMaps, Methods, choose_explainers, 
 from sliplens.explainers.frames import MARGIN_LEVELS, Baseline, ChosenFrames, FrameSelection
 from sliplens.explainers.occlusion import marker_regions, markers_in_recording, to_network_px
 from sliplens.explainers.table import EXPLAINERS, RECOMMENDED_METHOD
+from sliplens.extras import require_keywords
 from sliplens.images import Images, as_frames, read_image
 from sliplens.models import Network
 from sliplens.models.wrapping import Preprocess, open_run
@@ -52,7 +53,7 @@ def explain(
     source: Dataset | Path | str | Images,
     *,
     reference: Path | str | Images | None = None,
-    baseline: Baseline | Path | str | None = None,
+    baseline: Baseline | Images | Path | str | None = None,
     method: Methods | None = None,
     budget: float | None = None,
     select: FrameSelection | None = None,
@@ -122,6 +123,9 @@ def explain(
     >>> explanation.relevance["grad-cam"].shape
     (1, 224, 224)
     """
+    require_keywords(explain, running)
+    if isinstance(method, list | tuple) and not method:
+        raise InputError("there is no method; name one or more, or leave it out for the recommended one")
     for name in [method] if isinstance(method, str) else method if isinstance(method, Sequence) else ():
         if isinstance(name, str):
             EXPLAINERS.pick(name)
@@ -197,18 +201,19 @@ def _choose(
     )
 
 
-def _open_baseline(baseline: Baseline | Path | str | None, profile: SensorProfile | None) -> Baseline | None:
+def _open_baseline(baseline: Baseline | Images | Path | str | None, profile: SensorProfile | None) -> Baseline | None:
     """Read the image of a baseline, and fit it to the network's sensor by its profile."""
     if baseline is None or (isinstance(baseline, str) and baseline in BASELINES and baseline != "given"):
         return cast("Baseline | None", baseline)
-    if not isinstance(baseline, np.ndarray):
+    if isinstance(baseline, str | Path):
         if not Path(baseline).is_file():
             raise InputError(
                 f"the baseline {baseline} is no image; give untouched, stick, black, mean, blurred, or the path of an "
                 "image"
             )
         baseline = read_image(Path(baseline))
-    return baseline if profile is None else profile.apply(baseline)
+    image = as_frames(baseline, what="levels of the baseline")[0]
+    return image if profile is None else profile.apply(image)
 
 
 @dataclass(frozen=True, kw_only=True)

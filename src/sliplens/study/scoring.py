@@ -10,7 +10,7 @@ from typing import Literal, TypeAlias, Unpack
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from sliplens.codec import load_result
@@ -22,9 +22,11 @@ from sliplens.explainers.gradients import IntegratedGradients
 from sliplens.explainers.occlusion import tile_regions
 from sliplens.explainers.poly_cam import PolyCam
 from sliplens.explainers.shapley import Shapley
+from sliplens.extras import require_keywords
 from sliplens.faithfulness import controls, scoring
 from sliplens.faithfulness.fills import get_fill
 from sliplens.faithfulness.removal import AREAS, RANDOM_ORDERS, SHARES, Units, score_maps
+from sliplens.images import Images, as_frames
 from sliplens.intervals import paired_difference
 from sliplens.models import Network
 from sliplens.models.wrapping import open_run
@@ -46,14 +48,15 @@ STUDY_ORDERS = 10
 _TILES_ACROSS = 14
 Influence: TypeAlias = Mapping[str, controls.Maps]
 """Maps that rank parts, of each method and control."""
+Maps: TypeAlias = Float[np.ndarray, "maps rows columns"] | Float[Tensor, "maps rows columns"] | Path | str
 
 
 def score(
     run: Network | nn.Module | Path | str,
-    frames: UInt8[np.ndarray, "images height width 3"] | Explanation | Path | str,
-    maps: Explanation | Float[np.ndarray, "maps rows columns"] | None = None,
+    frames: Images | Explanation | Path | str,
+    maps: Explanation | Maps | None = None,
     *,
-    reference: UInt8[np.ndarray, "height width 3"] | None = None,
+    reference: Images | None = None,
     signed: bool = True,
     fill: str = "reference",
     unit: Literal["pixel", "tile"] = "pixel",
@@ -78,8 +81,8 @@ def score(
     frames, reference
         Explanation, or the folder of one, which holds its frames; or the frames and the reference of `explain`.
     maps
-        Explanation of the frames; or an array (frames, size, size) of one number a pixel of the network's input, by
-        another tool. None where `frames` is an explanation.
+        Explanation of the frames, or its folder; or an array or tensor (frames, size, size) of one number a pixel of
+        the network's input, by another tool. None where `frames` is an explanation.
     signed
         Meaning of an array. If True, above zero where a pixel raises the prediction, as `Explanation.relevance` and the
         attributions of Captum, summed over the colours. Pixels then rank by sign(f(x) - f(reference)) times the map,
@@ -126,6 +129,7 @@ def score(
     >>> score.method, round(score.srg.estimate, 2), score.lead_over_controls.control  # doctest: +SKIP
     ('shapley-marker', 0.81, 'change')
     """
+    require_keywords(score, running)
     get_fill(fill)
     if random_orders < 1:
         raise InputError(f"{random_orders} random orders are too few; --random-orders must be at least 1")
@@ -176,9 +180,9 @@ def score(
 
 def _to_score(
     network: Network,
-    frames: np.ndarray | Explanation | Path | str,
-    maps: Explanation | np.ndarray | None,
-    reference: np.ndarray | None,
+    frames: Images | Explanation | Path | str,
+    maps: Explanation | Maps | None,
+    reference: Images | None,
     *,
     signed: bool,
 ) -> Explanation:
@@ -189,12 +193,18 @@ def _to_score(
         return load_explanation(Path(frames))
     if maps is None:
         raise InputError("the frames have no maps to score; give an explanation of them, or an array of maps")
+    if isinstance(maps, Path | str):
+        maps = load_explanation(Path(maps))
+    if isinstance(maps, Tensor):
+        maps = maps.detach().cpu().numpy()
+    frames = as_frames(frames)
     count = len(maps if isinstance(maps, np.ndarray) else maps.frames)
     if count != len(frames):
         raise SaliencyError(f"there are {count} maps of {len(frames)} frames; explain the frames that are scored")
     if not isinstance(maps, np.ndarray):
         return maps
-    explanation = join_maps(network, frames_from_arrays(network, frames, reference), {})
+    untouched = None if reference is None else as_frames(reference, what="levels of the reference")[0]
+    explanation = join_maps(network, frames_from_arrays(network, frames, untouched), {})
     for index, values in enumerate(maps):
         require_saliency(values, explanation.images.shape[-2:], where=f"map {index}")
     positive = (maps.min(axis=(1, 2)) >= 0) & (maps.max(axis=(1, 2)) > 0)

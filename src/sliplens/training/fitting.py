@@ -18,7 +18,7 @@ from torch.utils.data import DataLoader
 
 from sliplens.codec import save_result
 from sliplens.errors import InputError, ModelError, RecordingError
-from sliplens.extras import pick
+from sliplens.extras import pick, require_keywords
 from sliplens.files import output_folder, scratch_folder, versions
 from sliplens.images import has_colour
 from sliplens.models import Manifest, Network, build_model, load, save_checkpoint
@@ -142,6 +142,7 @@ def train(
     >>> network.manifest.input  # doctest: +SKIP
     'pair'
     """
+    require_keywords(train, options)
     accelerator = options.pop("accelerator", "auto")
     changes: TrainingChanges = {name: value for name, value in options.items() if value is not None}  # pyright: ignore[reportAssignmentType]
     start = load(start_from) if isinstance(start_from, str | Path) else start_from
@@ -160,8 +161,7 @@ def train(
         labelled = all(any(has_ratio(data.read_labels(info)) for info in some) for some in trials)
         config = config if labelled else replace(config, head="histogram")
     origin = {"input": encoding.name, "condition": condition, "data_hash": data.hash}
-    if start is not None:
-        origin["started_from"] = start.manifest.weights_sha256
+    origin |= {} if start is None else {"started_from": start.manifest.weights_sha256}
 
     def run(folder: Path, opened: Logger | None = None) -> Training:
         if start is not None and config.learns == "sequence":
