@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -163,7 +164,7 @@ def test_a_module_goes_in_without_wrapping():
         (small_module().state_dict(), {}, "load_state_dict"),
     ],
 )
-def test_what_cannot_be_wrapped_is_refused_with_its_cure(module: object, options: dict, cure: str):
+def test_what_cannot_be_wrapped_is_refused_with_its_cure(module: Any, options: dict, cure: str):
     with pytest.raises(SliplensError, match=cure):
         sl.wrap(module, **{"size": SIZE, **options})
 
