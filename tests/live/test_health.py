@@ -4,11 +4,13 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 
 import numpy as np
 import pytest
 
-from sliplens.live import Check, HealthMonitor, LiveFrame
+from sliplens.live import Check, HealthMonitor, LiveFrame, SimulatedSource
+from sliplens.live.contract import Pace
 from sliplens.live.health import check_novelty, margin_risk, severity
 from sliplens.markers import Tracker
 from sliplens.models.checkpoint import Estimate
@@ -150,6 +152,16 @@ def test_what_shows_noise_alone_while_something_else_changes_is_frozen(
 ):
     told = [scene.failed(frame) & {"halves", "frozen"} for frame in stopping(scene, rows=rows, force_n=force_n)]
     assert (told[2], told[-1]) == (set(), expected)
+
+
+@pytest.mark.parametrize("every", [1, 2, 4])
+def test_a_grip_is_never_frozen_whichever_frames_are_lost(every: int, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(Pace, "wait", lambda *_: True)
+    with SimulatedSource(rate_hz=30.0) as source:
+        monitor, frames = HealthMonitor(source.reference), islice(source.frames(), 0, 270, every)
+        checks = [check for frame in frames for check in monitor.check(frame) if check.name == "frozen"]
+    assert max(check.value for check in checks) > 0
+    assert all(check.ok for check in checks)
 
 
 def test_without_a_touch_there_is_nothing_to_tell(scene: Scene):

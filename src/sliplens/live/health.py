@@ -28,6 +28,8 @@ _BLOCK_PX = 4
 _CHANGED_SHARE, _NOISE_SHARE, _LEAST_SQUARE = 1.5, 0.2, 0.02
 """Of the noise of block means: share that shows a change, and share to which its square is known; and the mean square
 that rounding makes, in squared grey levels."""
+_QUIET_GROWTH = 1.05
+"""Of the least noise, from frame to frame: a camera that grows noisier is known again after some frames."""
 
 
 Measured = float | tuple[float, str] | None
@@ -66,6 +68,7 @@ class HealthMonitor:
         self._plane: Plane | None = None
         self._half_planes: list[Plane] = []
         """Picture at the last change of the upper half, and of the lower one."""
+        self._quiet = np.full(2, np.inf)
         self._force_n: np.ndarray | None = None
         self._changed_force_n: np.ndarray | None = None
         """Force at the last change of either half."""
@@ -108,11 +111,15 @@ class HealthMonitor:
         """Measure how many times as much one half has changed as the other since its last change, noise taken off.
 
         A half has changed once its mean square difference is above 1.5 times that from frame to frame, its noise; until
-        then it is compared with the picture of its last change.
+        then it is compared with the picture of its last change. The force counts from the last change of either half or
+        from the last frame that differs from the one before by more than the quietest frames lately did.
         """
         plane, ratio, changed = block_means(_green(frame.small), _BLOCK_PX), 0.0, self._changed_force_n is None
         noise = np.zeros(2) if self._plane is None else _half_squares(plane - self._plane)
         self._half_planes = self._half_planes or [plane, plane]
+        if self._plane is not None:
+            self._quiet = np.minimum(noise, _QUIET_GROWTH * self._quiet + _LEAST_SQUARE)
+            changed |= bool((noise > _CHANGED_SHARE * self._quiet + _LEAST_SQUARE).any())
         for half in (0, 1):
             squares = _half_squares(plane - self._half_planes[half])
             excess = np.maximum(squares - noise, 0)
