@@ -1,6 +1,7 @@
 """The Python blocks of the README run as they stand."""
 
 import re
+from functools import wraps
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ def hurry(monkeypatch: pytest.MonkeyPatch) -> None:
     """Run live for a twentieth of the time."""
     begin = LiveReader.__init__
 
+    @wraps(begin)
     def begin_short(self: LiveReader, *args: Any, seconds: float, **options: Any) -> None:
         begin(self, *args, seconds=seconds / 20, **options)
 

@@ -82,16 +82,16 @@ def pick(rows: Mapping[str, Row], name: str, *, noun: str) -> Row:
     return rows[name]
 
 
-def require_keywords(call: Callable[..., Any], given: Iterable[str]) -> None:
+def require_keywords(call: Callable[..., Any], keywords: Iterable[str]) -> None:
     """Raise a TypeError for a keyword that a call with `**options: Unpack[TypedDict]` does not take.
 
     Python itself accepts any keyword there.
     """
-    *named, options = signature(call).parameters.values()
+    *parameters, options = signature(call).parameters.values()
     accepted = get_args(options.annotation)[0].__annotations__
-    for name in given:
+    for name in keywords:
         if name not in accepted:
-            near = get_close_matches(name, [*accepted, *(parameter.name for parameter in named)], n=1)
+            near = get_close_matches(name, [*accepted, *(parameter.name for parameter in parameters)], n=1)
             cure = f"did you mean {near[0]!r}?" if near else f"it takes {', '.join(accepted)}"
             raise TypeError(f"{call.__name__}() has no parameter {name!r}; {cure}")
 

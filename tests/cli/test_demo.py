@@ -37,7 +37,7 @@ def test_the_demo_runs_every_stage_and_its_page_grows(
     assert pages[-1] == page.read_text(encoding="utf-8")
     # while something is missing the page says so and loads itself anew, and ends complete
     assert ['http-equiv="refresh"' in text for text in pages] == [True] * (len(pages) - 1) + [False]
-    assert len(pages) == 2
+    assert len(pages) == 2 + (out / "explain-real").is_dir()  # the reference is not everywhere
     assert "how well both networks predict" in pages[0]
     # each opens with the grip, above the verdict
     assert all(0 < text.index('id="opening"') < text.index('id="verdict"') for text in pages)

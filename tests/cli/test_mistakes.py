@@ -28,7 +28,7 @@ MISTAKES = {
     "explain RUN DATA -o OUT --trials 0": "--trials must be at least 1, got 0",
     "explain RUN DATA -o OUT --method lime": "no method named 'lime'; choose",
     "explain RUN DATA -o OUT --budget 2": "budget is 2.0; give a share",
-    "explain RUN --frames FRAMES/good -o OUT --method occlusion-marker": "markers do not show in difference images",
+    "explain RUN --frames FRAMES/good -o OUT --method occlusion-marker": "methods by marker need camera frames",
     "predict RUN DATA -o OUT.txt": "does not end in .parquet or .csv",
     "predict RUN DATA -o OUT.csv --batch-size 0": "--batch-size must be at least 1, got 0",
     "predict NOTHING DATA -o OUT.csv": "the run NOTHING does not exist",

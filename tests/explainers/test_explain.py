@@ -86,14 +86,14 @@ def test_markers_are_found_in_the_camera_frames(trained):
         values = [np.unique(relevance[regions == number]) for number in np.unique(regions)]
         assert len(values) == 17
         assert all(len(value) == 1 for value in values)
-    with pytest.raises(InputError, match="markers do not show in difference images"):
+    with pytest.raises(InputError, match="methods by marker need camera frames"):
         sliplens.explain(run, np.stack(frames), method="shapley-marker")
 
 
 def test_without_a_method_tiles_explain_where_no_markers_show_and_it_says_why(trained):
     explanation = sliplens.explain(trained("difference"), FRAMES[:1])
     notes = explanation.methods["shapley"]
-    assert notes.warnings[0].startswith("tiles, not markers: markers do not show in difference images")
+    assert notes.warnings[0].startswith("tiles, not markers: methods by marker need camera frames")
     [frame] = explanation.frames
     change = frame.prediction - frame.reference_prediction
     assert explanation.relevance["shapley"].sum() == pytest.approx(change, abs=1e-5)

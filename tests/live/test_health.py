@@ -158,6 +158,7 @@ def test_what_shows_noise_alone_while_something_else_changes_is_frozen(
 def test_a_grip_is_never_frozen_whichever_frames_are_lost(every: int, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(Pace, "wait", lambda *_: True)
     with SimulatedSource(rate_hz=30.0) as source:
+        assert source.reference is not None
         monitor, frames = HealthMonitor(source.reference), islice(source.frames(), 0, 270, every)
         checks = [check for frame in frames for check in monitor.check(frame) if check.name == "frozen"]
     assert max(check.value for check in checks) > 0

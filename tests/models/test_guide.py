@@ -51,4 +51,4 @@ def test_the_file_is_read_without_sliplens(
     assert f"safety margin {100 * names['margin'][0]:.0f} %" in out
     assert estimate.sigma is not None
     assert names["sigma"] == pytest.approx(estimate.sigma[0], abs=5e-3)
-    assert "give or take" in out
+    assert "standard deviation" in out
