@@ -185,8 +185,8 @@ class Plant:
         )  # fmt: skip
         arrays = {name: before for name, before in vars(old).items() if name != "time_s"}
         dropped = {1: old.dropped, 2: old.dropped[:, None]}
-        kept = {name: np.where(dropped[before.ndim], before, getattr(new, name)) for name, before in arrays.items()}
-        self.state = replace(new, **kept)
+        states = {name: np.where(dropped[before.ndim], before, getattr(new, name)) for name, before in arrays.items()}
+        self.state = replace(new, **states)
         return self.state
 
 
