@@ -15,7 +15,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # must be set before torch 
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 from torch.nn import functional
 
 import sliplens as sl
@@ -361,7 +361,8 @@ def _reasoning(results: Results, name: str, rng: np.random.Generator) -> Iterato
     truth, explained = results.truth[name], results.explanations[name]
     figure = {"difference": "Fig. 11", "raw": "Fig. 12"}[name]
     shares, half = _strongest(truth.effects)
-    clusters = _clusters(truth.effects)
+    frames = truth.effects.groups("frame_id").values()
+    clusters = np.array([(str(frame.day[0]), str(frame.trial[0])) for frame in frames]).T
     gap = mean_interval(shares - 0.5, clusters=clusters, rng=rng)
     why = (
         f"Share of two markers in all Shapley values of the stick game, in size: {100 * shares.mean():.0f} %; half of "
@@ -377,7 +378,7 @@ def _reasoning(results: Results, name: str, rng: np.random.Generator) -> Iterato
     if name == "raw":
         contact = [
             np.abs(frame.stick)[frame.state > 0].sum() / np.abs(frame.stick).sum() - (frame.state > 0).mean()
-            for frame in truth.effects.groups("frame_id").values()
+            for frame in frames
         ]
         gap = mean_interval(np.array(contact), clusters=clusters, rng=rng)
         why = "Share of the Shapley values on markers in contact less the share of these markers."
@@ -385,7 +386,8 @@ def _reasoning(results: Results, name: str, rng: np.random.Generator) -> Iterato
             figure, "Markers in the contact move the prediction more than others", name, "only these", gap, why=why
         )
         rows = [at for at, frame in enumerate(explained.frames) if 0.1 < (frame.safety_margin or 0) < 0.5]
-        border = _border(explained.image_size)
+        from_edge = np.arange(explained.image_size) / explained.image_size
+        border = np.minimum.outer(from_edge, from_edge) < _BORDER
         maps = np.clip(explained.relevance[POLY_CAM][rows].astype(np.float64), 0, None)
         lies = maps[:, border].sum(axis=1) / np.maximum(maps.sum(axis=(1, 2)), 1e-12) - border.mean()
         gap = mean_interval(lies, clusters=explained.clusters[:, rows], rng=rng)
@@ -411,18 +413,6 @@ def _strongest(effects: MarkerEffects) -> tuple[Float[np.ndarray, " frames"], Fl
         shares.append(total[1])
         half.append(1 + np.argmax(total >= 0.5))
     return np.array(shares), np.array(half, dtype=np.float64)
-
-
-def _clusters(effects: MarkerEffects) -> np.ndarray:
-    frames: Iterable[MarkerEffects] = effects.groups("frame_id").values()
-    return np.array([(str(frame.day[0]), str(frame.trial[0])) for frame in frames]).T
-
-
-def _border(size: int) -> Bool[np.ndarray, "size size"]:
-    border = np.zeros((size, size), dtype=bool)
-    wide = max(1, round(_BORDER * size))
-    border[:wide], border[:, :wide] = True, True
-    return border
 
 
 def main() -> None:
