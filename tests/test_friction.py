@@ -68,6 +68,15 @@ def test_impossible_slips_and_weights_are_refused(ratio: float, sigma: float):
         Friction(np.array([0.5, 0.6]), np.array([1.0, -1.0]))
 
 
+@pytest.mark.parametrize("value", [62.0, 0.0, -0.6, float("nan")])
+def test_a_slip_teaches_no_friction_that_cannot_be_given(value: float):
+    with pytest.raises(InputError) as given:
+        Friction(value)
+    with pytest.raises(InputError) as learnt:
+        Friction.from_slips([0.6, value])
+    assert str(given.value) == str(learnt.value)
+
+
 def rising(learner: SlipLearner, *, until: float, sigma: float = 0.03) -> float:
     """Read a ratio that rises by 0.6 a second from 0; gives the time at its end."""
     times = np.arange(0, until / 0.6 + 1e-9, 1 / 60)

@@ -124,7 +124,7 @@ def run_parts(
     Parameters
     ----------
     on
-        Row of `EXECUTORS` with its argument: `serial`, `processes`, `processes=4`, `ray`, `ray=ADDRESS`.
+        Name of an executor with its argument: `serial`, `processes`, `processes=4`, `ray`, `ray=ADDRESS`.
 
     Raises
     ------

@@ -12,7 +12,7 @@ from data_sets import save_dataset
 from own_recording import TARE, write_forces, write_video
 from there import there
 
-from sliplens.recordings import Recording, load_dataset
+from sliplens.recordings import Recording, check_dataset, load_dataset
 from sliplens.recordings.store import read_header, write_trial
 
 
@@ -73,6 +73,25 @@ def test_friction_given_or_not_frames_after_the_slip_are_0_and_a_wrong_one_is_to
         checked = capsys.readouterr()
         assert flagged == ("is sound" not in checked.out) == (name == "wrong")
         assert (f"{given:.2f} was given" in checked.err) == (name == "wrong")
+
+
+def test_doubts_of_an_import_are_said_in_the_same_words_everywhere(
+    tmp_path: Path, table: Path, video: Path, capsys: pytest.CaptureFixture[str]
+):
+    out = tmp_path / "data"
+    assert run("import", video, "-o", out, "--sensor", "mine", "--forces", table, "--frame-rate", 36) == 0
+    printed = " ".join(capsys.readouterr().err.split())
+    doubts = load_dataset(out).doubts
+    assert doubts.keys() == {"cup"}
+    assert len(doubts["cup"]) > 1
+    assert not load_dataset(out).read_labels(load_dataset(out).trials[0]).labelled.any()
+    assert all(doubt in printed for doubt in doubts["cup"])
+    found = check_dataset(out)
+    assert [(each.where, each.what, each.doubt) for each in found] == [("cup", doubt, True) for doubt in doubts["cup"]]
+    assert run("check", out) == 0
+    checked = capsys.readouterr()
+    assert "is sound" not in checked.out
+    assert all(doubt in " ".join(checked.err.split()) for doubt in doubts["cup"])
 
 
 def test_an_interrupted_import_goes_on_where_it_stopped(

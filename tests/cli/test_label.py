@@ -11,6 +11,7 @@ from command_line import refused, run
 from data_sets import contents, save_dataset
 from there import there
 
+from sliplens.errors import InputError
 from sliplens.recordings import (
     Corrections,
     LabelSettings,
@@ -225,4 +226,9 @@ def test_corrections_outside_their_data_set_are_refused_with_their_cure(
     for row, error in cases.items():
         table.write_text(f"trial,bad_frames,slip_s\n{row}\n")
         assert error in refused(capsys, "label", folder, "--no-audit", "--corrections", table)
+    with pytest.raises(InputError, match=r"corrections of .* are {'slip_s': 3}; give such as Corrections\(slip_s="):
+        label_dataset(folder, corrections={trial.trial: {"slip_s": 3}})  # pyright: ignore[reportArgumentType]
+    for data in ([folder], None, 3):
+        with pytest.raises(InputError, match="is no data set; give its folder"):
+            label_dataset(data)  # pyright: ignore[reportArgumentType]
     assert contents(folder) == before

@@ -110,7 +110,7 @@ def test_words_hold_what_the_labels_rest_on():
         ({"lag_applied": True}, "15.0 ± 9.0 ms, taken off"),
         ({"friction": replace(FRICTION, low=MU, high=MU)}, "taken as exact"),
         ({"slip_s": None}, "no slip found"),
-        ({"axes": replace(AXES, notes=("the normal axis is doubtful",))}, "▲ the normal axis is doubtful"),
+        ({"doubts": ("the normal axis is doubtful",)}, "▲ the normal axis is doubtful"),
     ],
 )
 def test_words_follow_the_labels(changes, fact):
@@ -202,7 +202,8 @@ def test_no_words_lie_over_others_or_leave_the_page(size):
         slip_s=1970.1,
         lag=Lag(lag_s=-0.1, sigma_s=0.1, correlation=0.2, doubt="several lags fit alike " * 4),
         friction=replace(FRICTION, low=MU, high=MU, method="given by hand, after three trials by eye"),
-        axes=replace(AXES, tare_n=(-1234.5, 2345.6, -3456.7), notes=("the normal axis is doubtful",)),
+        axes=replace(AXES, tare_n=(-1234.5, 2345.6, -3456.7)),
+        doubts=("the normal axis is doubtful",),
     )
 
     outside, pairs = misplaced(draw_audit(trial, told))

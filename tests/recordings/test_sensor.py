@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from there import there
 
 from sliplens.errors import ImageError, InputError
 from sliplens.recordings.options import LabelSettings
@@ -110,6 +111,7 @@ def test_a_source_is_read_through_its_profile_and_what_is_said_of_the_reference_
     np.testing.assert_array_equal(next(capture.read_frames()), TIP.apply(FRAME))
     assert capture.read_reference is not None
     np.testing.assert_array_equal(capture.read_reference(), TIP.apply(frames[2]))
+    assert there(capture.reference_choice).method == "named by the profile tip"
     (capture,) = open_source(frames, sensor=profile, reference=FRAME)
     assert capture.read_reference is not None
     np.testing.assert_array_equal(capture.read_reference(), TIP.apply(FRAME))

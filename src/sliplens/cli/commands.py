@@ -270,22 +270,17 @@ def call_split(call: Any) -> None:
 @command("check", "recordings.check:check_dataset", "sliplens check runs/mine/data")
 def call_check(call: Any) -> None:
     """Print the findings; exit code 2 if there are any."""
-    from sliplens.recordings.dataset import load_dataset, trial_path
-    from sliplens.recordings.store import read_header
+    from sliplens.recordings.dataset import load_dataset
 
     data = load_dataset(call.keywords["data"])
     findings = call(data=data)
-    if findings:
-        print_table("Findings", [{"where": finding.where, "what": finding.what} for finding in findings])
-        count = number_of(len(findings), "error")
+    if errors := [{"where": each.where, "what": each.what} for each in findings if not each.doubt]:
+        print_table("Findings", errors)
+        count = number_of(len(errors), "error")
         raise RecordingError(f"{data.folder} has {count}, listed above; correct or make these trials again")
     size = f"{number_of(len(data.trials), 'trial')}, {number_of(data.frames, 'frame')}"
-    labellings = (read_header(trial_path(data.folder, info.trial)).labelling for info in data.trials)
-    bases = [labelling.basis for labelling in labellings if labelling and labelling.basis]
-    # frames at a fault of the force sensor are not valid, which puts no other frame in doubt
-    doubtful = sum(bool(basis.axes.notes or basis.friction.notes or basis.doubts) for basis in bases)
-    if doubtful:
-        about = f"the notes above put labels of {number_of(doubtful, 'trial')} in doubt"
+    if doubtful := {finding.where for finding in findings}:
+        about = f"the notes above put labels of {number_of(len(doubtful), 'trial')} in doubt"
         say(f"{data.folder} is whole: {size}, every hash and law holds, but {about}")
         return
     say(f"{data.folder} is sound: {size}, every hash and law holds")

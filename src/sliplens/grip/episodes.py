@@ -70,12 +70,12 @@ def run_episodes(
     Parameters
     ----------
     object
-        Row of `OBJECTS`.
+        `cup`, `egg` or `berries`.
     controller
-        Row of `CONTROLLERS` (docs/grip.md), or an object with `command(observation)`, of which each batch of episodes
+        Name of a controller (docs/grip.md), or an object with `command(observation)`, of which each batch of episodes
         gets a copy.
     condition
-        Row of `CONDITIONS`, from which the episodes are drawn.
+        Name of a condition (docs/grip.md), from which the episodes are drawn.
     episodes, seed
         Number of episodes, and the seed they are drawn from: the same seed gives every controller the same episodes.
     network

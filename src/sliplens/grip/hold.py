@@ -64,7 +64,7 @@ def hold_grip(
         Gripper, or an address as in `open_gripper`, whose connection is closed at the end; `simulated` for the gripper
         of the source `grip`; `dry-run` to record commands as if the gripper obeyed at once.
     controller
-        Row of `CONTROLLERS`, or an object with `command(observation)`.
+        Name of a controller (docs/grip.md), or an object with `command(observation)`.
     settings
         Constants of a row to change, in its units (newtons, seconds, shares).
     ceiling_n

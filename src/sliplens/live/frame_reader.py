@@ -49,7 +49,7 @@ class ReaderSettings(TypedDict, total=False):
     """If True, the earlier frames of a contact count, as `predict` takes it. Health and markers show when a contact
     ends: without both, all frames count as one."""
     engine: str
-    """Row of `ENGINES`; `auto`, the default, for the fastest that pays for `seconds`, or for hours without it."""
+    """`torch`, `openvino`, or `auto`, the default, for the fastest that pays for `seconds`, or for hours without it."""
     device: str
     """Device of a network that is loaded here: cpu (default) or cuda."""
     seconds: float | None

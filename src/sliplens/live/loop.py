@@ -279,7 +279,7 @@ class LiveReader(FrameReader):
     def send_to(self, *sinks: str) -> None:
         """Send every reading and its frame to other programs from now on, until it is closed.
 
-        Each is the name of a row of `SINKS`, with its address after a colon. A slow sink loses readings and counts
+        Each is the name of a sink (docs/live.md), with its address after a colon. A slow sink loses readings and counts
         them, and one that fails is listed in `troubles`; the reading goes on.
 
         Raises

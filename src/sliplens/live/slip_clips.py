@@ -61,7 +61,7 @@ def evaluate_slip(table: Path | str, *, after: int | None = None, markers: str =
     after
         Frames after the start at which a clip is classified, from those before alone; its end if None.
     markers
-        Row of `KINDS`.
+        Kind of markers (docs/markers.md).
 
     Raises
     ------

@@ -225,7 +225,7 @@ class SimulatedSource(LiveSource):
     Parameters
     ----------
     sensor
-        Row of `SENSORS`.
+        `chromatouch` or `flat-gel`.
     friction
         Coefficient of friction of the object.
     rate_hz

@@ -99,12 +99,12 @@ def track(
         Data set, folder of images, video, bag, uint8 RGB frames (frames, height, width, 3), or captures of
         `open_source`.
     markers
-        Row of `KINDS` (docs/markers.md).
+        Kind of markers (docs/markers.md).
     source_options
         `reference`, `reference_frame`, `split`, `trial`, `format`, `options` and `sensor` of `open_source`. Without a
         reference, displacements count from the first frame.
     on
-        Where the trials are tracked, a row of `runner.EXECUTORS`: `serial`, `processes`, `processes=4`, `ray`.
+        Where the trials are tracked: `serial`, `processes`, `processes=4`, `ray`.
     out
         Parquet file to write; without a suffix a folder, a Parquet data set with a file a trial. It appears when
         complete, and an interrupted call continues after its last trial. If None, rows stay in memory.

@@ -73,7 +73,7 @@ def wrap(
     size
         Height and width of its input, in pixels; frames are resized to it.
     encoding
-        Way to make images of frames: `rgb`, the frame divided by 255, or another row of `ENCODINGS`, such as
+        Way to make images of frames: `rgb`, the frame divided by 255, or another encoding, such as
         `difference`.
     preprocess
         Differentiable function from images (batch, 3, size, size) in [0, 1] to the module's input, such as

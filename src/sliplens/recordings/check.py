@@ -23,10 +23,11 @@ _ROUNDING = 1e-6
 
 @dataclass(frozen=True, kw_only=True)
 class Violation:
-    """Law that a data set violates."""
+    """Law that a data set violates, or doubt about the labels of a trial."""
 
     where: str  #: The trial, or the file of the data set.
-    what: str  #: Error, and the frame it is at.
+    what: str  #: Error, and the frame it is at; or the doubt.
+    doubt: bool = False  #: True for a doubt: the data are whole, and the labels may be wrong.
 
 
 def check_dataset(
@@ -35,12 +36,12 @@ def check_dataset(
     against: Dataset | Path | str | None = None,
     on_progress: OnProgress | None = None,
 ) -> tuple[Violation, ...]:
-    """Read every trial of a data set and list its errors, and those of its trials that another data set holds too.
+    """Read every trial of a data set, and list its errors, doubts, and those trials that another data set holds too.
 
     For each trial: its file exists, has the hash and the facts of the table, and every image can be decoded; margin,
     forces and contact states agree, and F_t / F_n stays within the friction by 3 sigma, before a slip and after it. For
-    the data set: no trial is listed twice, no file is unlisted, and no recording was cut off. Flags on labels, such as
-    faults of the force sensor, are notes: frames at a fault are not valid.
+    the data set: no trial is listed twice, no file is unlisted, and no recording was cut off. Doubts about labels are
+    those of the import. Faults of the force sensor are notes: frames at a fault are not valid.
 
     Parameters
     ----------
@@ -63,7 +64,7 @@ def check_dataset(
     ((), 3)
     """
     data = load_dataset(data)
-    folder, violations, labellings = data.folder, [], []
+    folder, violations = data.folder, []
     for trial, count in Counter(info.trial for info in data.trials).items():
         if count > 1:
             splits = sorted({info.split for info in data.trials if info.trial == trial})
@@ -80,9 +81,9 @@ def check_dataset(
         checked = in_turn(lambda info: tuple(_check_trial(folder, info)), data.trials)
         for info, errors in zip(report_each(data.trials), checked, strict=True):
             violations += [Violation(where=info.trial, what=error) for error in errors]
-            with suppress(SliplensError):  # an unreadable file is among the violations
-                labellings.append((info.trial, read_header(trial_path(folder, info.trial)).labelling))
-        report_flags(labellings)
+        report_flags(data)
+        doubts = [(trial, doubt) for trial, sentences in data.doubts.items() for doubt in sentences]
+        violations += [Violation(where=trial, what=doubt, doubt=True) for trial, doubt in doubts]
         violations += [] if against is None else _find_shared(data, load_dataset(against))
     return tuple(violations)
 

@@ -156,8 +156,10 @@ def label_dataset(
             corrections = before
         elif not isinstance(corrections, Mapping):
             corrections = read_corrections(corrections)
-        for trial in corrections:
+        for trial, row in corrections.items():
             data.find(trial)
+            if not isinstance(row, Corrections):
+                raise InputError(f"the corrections of {trial} are {row!r}; give such as Corrections(slip_s=3.2)")
         work = _Relabelling(data=data, labelling=labelling, corrections=corrections)
         for number in range(len(data.trials)):  # mistakes are found before anything slow
             work.open(number)

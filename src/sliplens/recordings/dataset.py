@@ -2,7 +2,7 @@
 
 import shlex
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
@@ -14,7 +14,7 @@ import pyarrow as pa
 from filelock import FileLock, Timeout
 
 from sliplens.codec import Result, from_builtins, one_line, to_builtins
-from sliplens.errors import RecordingError
+from sliplens.errors import InputError, RecordingError, SliplensError
 from sliplens.files import (
     hash_file,
     hash_json,
@@ -29,7 +29,7 @@ from sliplens.images import encode_png, read_image
 from sliplens.progress import OnProgress, add_note, fold_equal, number_of, report_file, reporting
 from sliplens.recordings import store
 from sliplens.recordings.capture import Capture, Forces, Frame
-from sliplens.recordings.labelling import Labelling, ReferenceChoice
+from sliplens.recordings.labelling import LabelBasis, Labelling, ReferenceChoice
 from sliplens.recordings.sensor import SENSORS_FOLDER, SensorProfile, load_profile, profile_text
 from sliplens.recordings.store import SCHEMA_VERSION, StoredFacts, forces_path, load_recording, read_header
 from sliplens.recordings.trial import Recording, TrialFacts, labels_of_margins
@@ -77,6 +77,11 @@ class Dataset(Result):
         return hash_json([asdict(trial) for trial in self.trials])
 
     @property
+    def doubts(self) -> dict[str, tuple[str, ...]]:
+        """Doubts about the labels of each trial that has any, a sentence each."""
+        return {trial: basis.doubts for trial, basis in self.read_bases().items() if basis.doubts}
+
+    @property
     def frames(self) -> int:
         """Number of frames of all trials."""
         return sum(trial.frames for trial in self.trials)
@@ -112,6 +117,15 @@ class Dataset(Result):
     def read_labels(self, info: TrialInfo) -> Recording:
         """Read the labels of one trial, with its reference and without its frames."""
         return load_recording(trial_path(self.folder, info.trial), pixels=False)
+
+    def read_bases(self) -> dict[str, LabelBasis]:
+        """Read the estimates behind the labels of the trials that were labelled from forces and can be read."""
+        bases = {}
+        for info in self.trials:
+            with suppress(SliplensError):
+                labelling = read_header(trial_path(self.folder, info.trial)).labelling
+                bases |= {info.trial: labelling.basis} if labelling and labelling.basis else {}
+        return bases
 
     def open(self, info: TrialInfo, *, samples: bool = True) -> Capture:
         """Open one trial as a recording, with or without the samples of its forces; no frame is read yet."""
@@ -161,6 +175,8 @@ def load_dataset(folder: Dataset | Path | str) -> Dataset:
     """
     if isinstance(folder, Dataset):
         return folder
+    if not isinstance(folder, Path | str):
+        raise InputError(f"{folder!r} is no data set; give its folder, or the Dataset that was made or loaded")
     folder = require_folder(Path(folder), what="the data set")
     data, unfinished = _read(folder), ""
     if (folder / JOURNAL_FOLDER).is_dir():
@@ -250,16 +266,15 @@ def finish_recording(folder: Path, lock: FileLock | None = None) -> None:
             folder.rmdir()
 
 
-def report_flags(labellings: Iterable[tuple[str, Labelling | None]]) -> None:
+def report_flags(data: Dataset) -> None:
     """Note the flags on the labels of trials, equal ones of several trials once."""
-    bases = [(trial, labelling.basis) for trial, labelling in labellings if labelling and labelling.basis]
-    for message in fold_equal(f"{trial}: {flag}" for trial, basis in bases for flag in basis.flags):
+    for message in fold_equal(f"{trial}: {flag}" for trial, basis in data.read_bases().items() for flag in basis.flags):
         add_note(message)
 
 
 def report_dataset(data: Dataset, *, existed: bool) -> None:
     """Report a data set that was written, or was there already, and the flags on its labels."""
-    report_flags((info.trial, read_header(trial_path(data.folder, info.trial)).labelling) for info in data.trials)
+    report_flags(data)
     count = f"{number_of(len(data.trials), 'trial')}, {number_of(data.frames, 'frame')}"
     report_file(data.folder, count, kept=existed)
 

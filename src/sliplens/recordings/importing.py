@@ -146,6 +146,8 @@ def import_trial(job: TrialJob, path: Path) -> None:
                 reference, choice = capture.reference, capture.reference_choice or ReferenceChoice(method=method)
             else:
                 choice = choose_reference(footage.read, untouched, index=index)
+                if index is not None and settings.reference_frame is None:
+                    choice = capture.reference_choice or choice
                 (reference,) = footage.read([choice.index or 0])
         except RecordingError as error:
             raise RecordingError(f"{capture.source}: {error}{job.cure}") from None
@@ -225,7 +227,7 @@ class ImportOptions(TypedDict, total=False):
     object: str | None
     """Name of the object."""
     format: str | None
-    """Row of `FORMATS`; recognised by names if None."""
+    """Name of a format (docs/recordings.md); recognised by file names if None."""
     validation_trials: int | None
     """Number of trials to validate: the last before those that test."""
     test_trials: int | None
@@ -275,7 +277,7 @@ def import_recordings(
         If True, add to the data set in `out`. Its trials stay, and so do their splits unless `splits` assigns all of
         them.
     on
-        Where trials are made, a row of `runner.EXECUTORS`: `serial` (several side by side in threads), `processes`,
+        Where trials are made: `serial` (several side by side in threads), `processes`,
         `processes=4`, `ray`.
     **options
         `ImportOptions`. By default the reference is that of the source, else one of the frames before the contact.

@@ -141,12 +141,12 @@ class LabelBasis:
     lag_applied: bool
     contact_threshold_n: float
     faults: tuple[ForceFault, ...] = ()  #: Samples that were left out, in the order of time.
-    doubts: tuple[str, ...] = ()  #: Other implausible findings, a sentence each.
+    doubts: tuple[str, ...] = ()  #: Doubts about the labels, those about axes and friction among them, a sentence each.
 
     @property
     def flags(self) -> tuple[str, ...]:
-        """All doubts about the labels, a sentence each."""
-        return (*describe_faults(self.faults), *self.axes.notes, *self.friction.notes, *self.doubts)
+        """Faults of the force sensor, frames at which are not valid, and doubts; a sentence each."""
+        return (*describe_faults(self.faults), *self.doubts)
 
 
 def describe_faults(faults: Sequence[ForceFault]) -> tuple[str, ...]:

@@ -16,6 +16,7 @@ from PIL import Image
 from sliplens.errors import ImageError, InputError
 from sliplens.files import MOST_TEXT, require_file
 from sliplens.recordings.capture import Capture, Frame
+from sliplens.recordings.labelling import ReferenceChoice
 from sliplens.recordings.options import LabelSettings
 
 _MOST_STRETCH = 0.02  # of width against height: markers stay round, and distances mean the same along both
@@ -107,8 +108,10 @@ class SensorProfile:
 
     def prepare(self, capture: Capture) -> Capture:
         """Return a recording with prepared frames and reference, and the name of the sensor."""
-        index = capture.reference_index
-        index = self.reference_frame if index is None and capture.reference is None else index
+        index, choice = capture.reference_index, capture.reference_choice
+        if index is None and capture.reference is None and self.reference_frame is not None:
+            index = self.reference_frame
+            choice = ReferenceChoice(index=index, method=f"named by the profile {self.name}")
         if index is not None and not 0 <= index < len(capture):
             frames = f"{capture.source} has {len(capture)} frames but the profile {self.name} takes frame {index}"
             raise InputError(f"{frames} for the untouched sensor; name one that is there with --reference-frame")
@@ -119,6 +122,7 @@ class SensorProfile:
             read_frames=lambda: map(self.apply, capture.read_frames()),
             reference=None if capture.reference is None else self.apply(capture.reference),
             reference_index=index,
+            reference_choice=choice,
         )
 
     def settings(self, settings: LabelSettings) -> LabelSettings:
@@ -182,8 +186,9 @@ def load_profile(profile: Path | str | SensorProfile) -> SensorProfile:
 
 
 def is_profile(sensor: Path | str | SensorProfile) -> bool:
-    """Return True for a profile, a TOML file, or the name of a profile that comes with sliplens."""
-    return isinstance(sensor, SensorProfile) or str(sensor).endswith(".toml") or str(sensor) in shipped_profiles()
+    """Return True for a profile, a name that looks like a file, or that of a profile that comes with sliplens."""
+    named = str(sensor) in shipped_profiles() or re.search(r"[/\\]|\.[A-Za-z]+$", str(sensor))
+    return isinstance(sensor, SensorProfile | Path) or bool(named)
 
 
 def profile_text(profile: SensorProfile, *, notes: tuple[str, ...] = ()) -> str:

@@ -61,7 +61,7 @@ def open_source(
     split, trial
         Trials of a data set, or the name of one; all if None.
     format
-        Row of `FORMATS`; recognised if None.
+        Name of a format (docs/recordings.md); recognised if None.
     options
         Facts about a source that is no data set.
     sensor

@@ -168,9 +168,9 @@ def make_recipe(
     Parameters
     ----------
     preset
-        Row of `PRESETS`.
+        `small`, `thesis` or `varied`.
     sensor
-        Row of `SENSORS`; that of the preset if None.
+        `chromatouch` or `flat-gel`; that of the preset if None.
     changes
         Fields of `SimulationRecipe`, such as `dry_trials`, `frames_per_trial`, `days` or `seed`. None leaves one as it
         is. With other numbers of trials, days or frames the preset's totals no longer hold.

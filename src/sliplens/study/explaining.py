@@ -39,7 +39,7 @@ class Running(TypedDict, total=False):
     device: str
     """Device of the network: `cpu`, `cuda` or `cuda:1`; `cpu` by default."""
     on: str
-    """Row of `runner.EXECUTORS`: `serial` (default), `processes`, `processes=4`."""
+    """Where maps are made: `serial` (default), `processes`, `processes=4`."""
     overwrite: bool
     """If True, replace the folder `out`."""
     preprocess: Preprocess | None
@@ -79,9 +79,8 @@ def explain(
         and recordings, `untouched` for arrays and folders of images, or `black` where there is no reference. Where no
         stick frame is found, the untouched sensor takes its place, with a warning.
     method
-        Row of `EXPLAINERS` (docs/explainers.md), an explainer such as `get_explainer("occlusion", tile_px=8)`, or
-        several of them. If None, Shapley values of the markers (`RECOMMENDED_METHOD`), or of tiles where no markers are
-        found.
+        Name of a method (docs/explainers.md), an explainer such as `get_explainer("occlusion", tile_px=8)`, or several
+        of them. If None, Shapley values of the markers, or of tiles where no markers are found.
     budget
         Share of the channels that `poly-cam` measures at first; below 1 it is faster. If None, 1 for one frame and 0.15
         for several.

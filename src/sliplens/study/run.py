@@ -71,7 +71,7 @@ def run_study(
     out
         Folder of the study, a subfolder a step; a temporary one that lives as long as the result if None.
     on
-        Where maps are made and judged, a row of `runner.EXECUTORS`: `serial`, `processes`, `processes=4`. Processes
+        Where maps are made and judged: `serial`, `processes`, `processes=4`. Processes
         need a script that starts its work under `if __name__ == "__main__":`.
 
     Raises

@@ -89,8 +89,8 @@ def score(
         as those of an `Explanation` do. If False, larger where a pixel matters more, whichever way the prediction went,
         as a saliency in [0, 1].
     fill
-        Content of removed pixels, a row of `FILLS`; `reference`, the baseline of the explanation, is one that networks
-        know.
+        Content of removed pixels (docs/deletion.md); `reference`, the baseline of the explanation, is one that
+        networks know.
     unit
         What is removed at once: pixels, or square tiles of a fourteenth of the image.
     random_orders

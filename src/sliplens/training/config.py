@@ -34,7 +34,7 @@ class TrainingConfig:
     """Name of the recipe, for the manifest."""
     backbone: str = DEFAULT_BACKBONE
     head: str = "point"
-    """Outputs of the network, a row of `sliplens.models.backbones.HEADS`."""
+    """Outputs of the network: `point`, `histogram` or `margin-and-ratio`."""
     image_size: int = 224
     epochs: int = 25
     batch_size: int = 64

@@ -102,9 +102,10 @@ def train(
     out
         Folder to write: weights, manifest, learning curve; nothing is kept if None.
     input
-        Input of the network, a row of `ENCODINGS`; by default that of `start_from`, else `difference`.
+        Input of the network: `difference`, `raw`, `rgb`, `signed`, `amplitude` or `pair`; by default that of
+        `start_from`, else `difference`.
     recipe
-        Row of `RECIPES`.
+        `default`, `thesis`, `ratio`, `sequence` or `adapt`.
     start_from
         Network whose weights to start from, its folder, or the name of one that comes with sliplens: to teach it
         another sensor, or to go on at another image size. It keeps its input, backbone and head.

@@ -10,7 +10,7 @@ from sliplens.recordings.capture import Forces
 from sliplens.recordings.labelling import Lag
 from sliplens.recordings.labels.lag import doubt_agreement, estimate_lag, measure_motion
 
-from .conftest import FORCE_HZ, FRAME_HZ, Trial
+from .conftest import FORCE_HZ, FRAME_HZ, SLIP_S, Trial
 
 
 def seed() -> np.random.Generator:
@@ -107,6 +107,47 @@ def test_clocks_of_another_zero_are_refused(trial: Trial, rng: np.random.Generat
     forces = replace(trial.forces(), time_s=trial.time_s + 1e9)
     with pytest.raises(RecordingError, match=r"no lag up to 0.25 s lets the forces of sensor cover the frames; bring"):
         estimate_lag(trial.frame_time_s, trial.motion, forces, rng=rng)
+
+
+@pytest.mark.parametrize(
+    ("speed", "late_s"),
+    [
+        (25 / 30, 0),
+        (0.8, 0),
+        (1.25, 0),
+        (0.9, 0),
+        (1.1, 0),
+        (1, 0.1),
+        (1, -0.1),
+        (1, 0.3),
+        (1, -0.5),
+        (1, 1.5),
+        (1, -1.5),
+    ],
+)
+def test_labels_by_another_clock_are_doubted_and_none_is_valid(trial: Trial, speed: float, late_s: float):
+    forces = trial.forces(noise_n=0.02, rng=seed(), tare_n=(1.0, 2.0, -1.0))
+    wrong = replace(trial, frame_time_s=trial.frame_time_s * speed + late_s, motion=frames_of(trial))
+    labels = wrong.label(forces)
+    assert any("--frame-rate" in doubt and "--apply-lag" in doubt for doubt in labels.basis.doubts)
+    assert not labels.valid.any()
+    # a clock that differs by a known or an estimated lag only is right once that is applied
+    if speed == 1 and abs(late_s) < 0.2:
+        for settings in ({"lag_ms": 1000 * late_s}, {"apply_lag": True}):
+            mended = wrong.label(forces, **settings)
+            assert mended.basis.doubts == ()
+            error = np.abs(mended.safety_margin - trial.truth)[mended.valid]
+            assert np.all(error < 4 * mended.safety_margin_sigma[mended.valid])
+
+
+def test_frames_that_end_before_the_slip_of_the_forces_say_so(trial: Trial):
+    forces, before = trial.forces(noise_n=0.02, rng=seed()), trial.frame_time_s < SLIP_S - 0.2
+    early = replace(trial, frame_time_s=trial.frame_time_s[before], motion=frames_of(trial)[before])
+    labels = early.label(forces)
+    (doubt,) = labels.basis.doubts
+    assert re.match(r"the forces slip at 4\.5\d s, and the frames are from 0\.01 to 4\.\d+ s; if ", doubt)
+    # a camera that stopped earlier has right labels
+    assert labels.valid.any()
 
 
 def frames_of(trial: Trial, *, until_s: float = np.inf) -> np.ndarray:

@@ -1,3 +1,4 @@
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -193,6 +194,18 @@ def test_without_a_tangential_force_there_is_no_margin(trial: Trial, mu: float |
     pressed = replace(trial, contact_n=trial.contact_n * np.array([1, 0, 0]))
     with pytest.raises(RecordingError, match=r"sensor has no tangential force .* name the columns of all axes"):
         trial.label(pressed.forces(tare_n=TARE), mu=mu)
+
+
+@pytest.mark.parametrize("factor", [1000, 1 / 1000])
+def test_forces_in_another_unit_than_named_are_doubted(trial: Trial, rng: np.random.Generator, factor: float):
+    forces = trial.forces(noise_n=0.02, rng=rng, tare_n=TARE)
+    right, wrong = (trial.label(trial.record(scale * forces.force_n)) for scale in (1, factor))
+    (doubt,) = wrong.basis.doubts
+    assert "--force-unit" in doubt
+    assert float(there(re.search(r"normal force is (\S+) N", doubt))[1]) == pytest.approx(1.5 * factor, rel=0.1)
+    assert right.basis.doubts == ()
+    # a margin has no unit
+    np.testing.assert_allclose(wrong.safety_margin[wrong.valid], right.safety_margin[right.valid], atol=1e-6)
 
 
 def test_few_frames_are_labelled_without_a_lag(trial: Trial, rng: np.random.Generator):

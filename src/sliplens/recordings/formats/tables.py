@@ -27,6 +27,7 @@ _HEAD = 200  # lines, of which most are rows: what comes before the header is te
 _LACKING = ("", "nan", "na", "n/a", "null")  # fields of a sample that dropped out
 _LONGEST_LINE = 100_000  # characters; a file without line breaks would be held whole
 _COARSE_STAMPS, _COARSE_SHARE = 3, 0.1  # distinct stamps, and share of samples without their own, of a coarse clock
+_NO_TABLES = {".toml", ".json", ".yaml", ".yml", ".ini", ".md"}  # text that may look like columns
 _CSV = "export the table as CSV in UTF-8"
 
 UNITS = {
@@ -96,6 +97,8 @@ def open_text_table(path: Path) -> TextTable:
 
     Before the header may be a byte order mark, comments, lines such as `sep=;` and other text; below it a row of units.
     """
+    if path.suffix.lower() in _NO_TABLES:
+        raise RecordingError(f"{path} is no table; name one (CSV), with a header and a row a sample")
     lines = text_lines(path)
     head = list(islice(lines, _HEAD))
     plain = [(line, text) for line, text in head if not text.lstrip().startswith(("#", "%"))]

@@ -69,6 +69,8 @@ _LOAD_WINDOW_S, _PART = 0.03, (0.25, 0.75)  # of the load whose release is timed
 _SUDDEN_STEPS = 2.0  # a fall between these within so many frames has a sharp time, however the gel yields
 _LOADED_SHARE = 0.15  # of the load of a trial: a larger force is a contact
 _APART_S = 0.3  # contacts that are closer are one, and the image may move as long about it
+# a lag beyond so many sigmas, and frames, is no accident; a clock of another speed makes sigma large as well
+_FAR_SIGMAS, _FAR_FRAMES = 2.0, 2.0
 _LEAST_FRAMES = 24  # of fewer, noise alone correlates by as much as a contact does
 # quantile of the image motion in the contacts, and the share of it that shows another contact in as many frames
 _MOVES, _LEAST_MOVES = (0.98, 0.5), 3
@@ -150,6 +152,22 @@ def force_changes(time_s: Float[np.ndarray, " frames"], forces: Forces) -> Float
     inside = (time_s >= forces.time_s[0]) & (time_s <= forces.time_s[-1])
     force[~inside] = np.nan
     return np.linalg.norm(np.diff(force, axis=0), axis=1)
+
+
+def doubt_lag(lag: Lag | None, *, applied: bool, frame_s: float) -> str:
+    """Describe a measured lag at which labels are those of another time; empty where there is none."""
+    if lag is None or lag.correlation is None:
+        return ""  # set by hand, or of too few frames to measure it
+    size_s = 0.0 if applied else abs(lag.lag_s)
+    far = size_s > max(_FAR_SIGMAS * lag.sigma_s, _FAR_FRAMES * frame_s)
+    if not far and lag.correlation >= _LEAST_CORRELATION:
+        return ""
+    late = f"{'late' if lag.lag_s > 0 else 'early'} by {1000 * size_s:.0f} +- {1000 * lag.sigma_s:.0f} ms"
+    measured = f"unknown: {lag.doubt}" if lag.doubt else f"{size_s / frame_s:.1f} frames"
+    return (
+        f"the camera is {late} ({measured}); check that the forces are those of this video, give --frame-rate or "
+        "--time-unit if a clock runs wrong, and --start-s, --lag-ms or --apply-lag if only its zero differs"
+    )
 
 
 def doubt_agreement(

@@ -16,7 +16,7 @@ from sliplens.recordings.labels import axes
 from sliplens.recordings.labels.axes import ContactForces, MeanForces, Samples
 from sliplens.recordings.labels.faults import FAULTS, MARKED, Screened, screen_trial
 from sliplens.recordings.labels.friction import ImageMotion, estimate_friction, find_contacts
-from sliplens.recordings.labels.lag import doubt_agreement
+from sliplens.recordings.labels.lag import doubt_agreement, doubt_lag
 from sliplens.recordings.options import LabelSettings
 from sliplens.recordings.trial import ContactState, Labels
 
@@ -31,6 +31,7 @@ _STUCK_SIGMAS = 2.0  # a margin nearer to 1 than so many standard deviations can
 _RATE_STEPS = 3.0  # frames on either side over which the rate of the margin is measured: fewer would show the noise
 _MOST_LOST = 0.5  # share of the samples between touch and slip that may be faulty
 _PLAUSIBLE_FRICTION, _USUAL_FRICTION = (0.05, 4.0), 1.5  # of soft skins on anything; of dry rubber on glass
+_PLAUSIBLE_N = 0.05, 200.0  # largest force of a contact: ten times a sensor's noise, and twice the hardest pinch
 # half way, by ratio, from equal lengths to one that is half the other: a rate is usually wrong by two or more
 _LIKE_SPANS = 0.7
 _NEAR_LAG_S = 0.12  # clocks that run alike fit best within some frames; others, if at all, far off
@@ -127,7 +128,8 @@ def label_frames(
         slipped |= (time >= onset_s) & (time < anew_s)
     margin = safety_margin(np.where(contact, at.normal_n, 0.0), at.tangential_n, friction.mu)
     margin = np.where(missing | (fault > 0), np.nan, np.where(slipped & contact, 0.0, margin))
-    valid = reliable & ~slipped & (sigma <= LARGEST_SIGMA)
+    other_time = bool(doubt_lag(lag, applied=apply_lag, frame_s=window))
+    valid = reliable & ~slipped & (sigma <= LARGEST_SIGMA) & (not other_time)
     holds = np.where(slipped & contact & (at.tangential_n > 0), used * friction.mu, friction.mu)
     return FoundLabels(
         force_time_s=time,
@@ -146,7 +148,7 @@ def label_frames(
             missing,
             ~contact,
             slipped,
-            ~valid & bool(friction.notes),
+            ~valid & (other_time or bool(friction.notes)),
             ~valid,
         ),
         basis=LabelBasis(
@@ -202,6 +204,8 @@ def label_trial(
         )
         labels = label_frames(frame_time_s, contact, friction=friction, lag=lag, settings=settings, screened=screened)
         doubts = (
+            *contact.axes.notes,
+            *friction.notes,
             *screened.doubts,
             *_find_doubts(contact, labels.basis, frame_time_s=frame_time_s, recorded_s=forces.time_s),
             *doubt_agreement(frame_time_s, image_motion, screened.forces, lag),
@@ -232,7 +236,13 @@ def require_inside(settings: LabelSettings, *, frames: int, time_s: Frames) -> N
 
 def _find_doubts(forces: ContactForces, basis: LabelBasis, *, frame_time_s: Frames, recorded_s: Samples) -> list[str]:
     """Describe an implausible friction, a contact that pulls more than it presses, and clocks of different lengths."""
-    friction, lag, doubts = basis.friction, basis.lag, []
+    friction, lag = basis.friction, basis.lag
+    other_time = doubt_lag(lag, applied=basis.lag_applied, frame_s=axes.typical_step(frame_time_s))
+    doubts = [other_time] if other_time else []
+    first_s, last_s = frame_time_s[[0, -1]] - (lag.lag_s if lag is not None and basis.lag_applied else 0.0)
+    if basis.slip_s is not None and not first_s <= basis.slip_s <= last_s:
+        outside = f"the forces slip at {basis.slip_s:.2f} s, and the frames are from {first_s:.2f} to {last_s:.2f} s"
+        doubts.append(f"{outside}; if the camera ran then, give --frame-rate, --time-unit or --start-s")
     begin = recorded_s[0] if basis.axes.still_until_s is None else basis.axes.still_until_s
     pull = recorded_s[(recorded_s > begin) & (recorded_s < (begin if friction.onset_s is None else friction.onset_s))]
     if np.isin(pull, forces.time_s, invert=True).sum() > _MOST_LOST * len(pull):
@@ -247,6 +257,10 @@ def _find_doubts(forces: ContactForces, basis: LabelBasis, *, frame_time_s: Fram
     elif friction.mu > _USUAL_FRICTION:
         seldom = f"that of a fingertip seldom exceeds {_USUAL_FRICTION:g}: check --normal-axis and --mu"
         doubts.append(f"the friction is {friction.mu:.3g}, and {seldom}")
+    pressed_n = float(forces.normal_n.max())
+    if not _PLAUSIBLE_N[0] <= pressed_n <= _PLAUSIBLE_N[1]:
+        usual = f"a fingertip presses with {_PLAUSIBLE_N[0]:g} to {_PLAUSIBLE_N[1]:g} N"
+        doubts.append(f"the largest normal force is {pressed_n:.3g} N, and {usual}; give --force-unit on import")
     pulls, presses = (np.mean(side > basis.contact_threshold_n) for side in (-forces.normal_n, forces.normal_n))
     if pulls > presses:
         samples = f"{100 * pulls:.0f} % of the samples, positive in {100 * presses:.0f} %"
