@@ -252,7 +252,8 @@ def import_recordings(
     """Import recordings and label every frame with its safety margin.
 
     Tare, axes, sign, lag and friction are estimated from each trial unless `labelling` gives them (docs/recordings.md).
-    Labels that come with a recording stay. An import that was interrupted goes on where it stopped.
+    Labels that come with a recording stay; `Dataset.doubts` lists doubts about the others. An import that was
+    interrupted goes on where it stopped.
 
     Parameters
     ----------
