@@ -269,8 +269,8 @@ def _frame_words(recording: Recording, at: int | None, *, reference: bool) -> st
     margin, sigma = recording.safety_margin[at], recording.safety_margin_sigma
     band = "" if sigma is None or np.isnan(sigma[at]) else f" ± {100 * sigma[at]:.1f}"
     title = f"Γ {100 * margin:.0f}{band} %" if np.isfinite(margin) else "no Γ"
-    state = f"{recording.contact_state[at]}{'' if recording.labelled[at] else ', not valid'}"
-    return f"{title}\n{recording.time_s[at]:.2f} s\n{state}"
+    valid = "" if recording.labelled[at] else ", not valid"
+    return f"{title}\n{recording.time_s[at]:.2f} s{valid}\n{recording.contact_state[at]}"
 
 
 def _write_facts(figure: Figure, recording: Recording, labelling: Labelling) -> None:
