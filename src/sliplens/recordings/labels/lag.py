@@ -159,7 +159,7 @@ def doubt_lag(lag: Lag | None, *, applied: bool, frame_s: float) -> str:
     if lag is None or lag.correlation is None:
         return ""  # set by hand, or of too few frames to measure it
     size_s = 0.0 if applied else abs(lag.lag_s)
-    far = size_s > max(_FAR_SIGMAS * lag.sigma_s, _FAR_FRAMES * frame_s)
+    far = size_s > _FAR_FRAMES * frame_s and (bool(lag.doubt) or size_s > _FAR_SIGMAS * lag.sigma_s)
     if not far and lag.correlation >= _LEAST_CORRELATION:
         return ""
     late = f"{'late' if lag.lag_s > 0 else 'early'} by {1000 * size_s:.0f} +- {1000 * lag.sigma_s:.0f} ms"
