@@ -112,7 +112,7 @@ class Friction:
             Standard deviation of each ratio.
         """
         ratios = np.asarray(ratios, dtype=np.float64)
-        friction = _unknown(cls(ratios).values if len(ratios) else None)
+        friction = _unknown(cls(ratios).nodes[0] if len(ratios) else None)
         for ratio in ratios.tolist():
             friction = friction.update(ratio, math.hypot(sigma, GRASP_SPREAD * ratio))
         return friction.next_grasp()

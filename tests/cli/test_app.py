@@ -1,6 +1,7 @@
 """Commands are functions: options, defaults and help come from their signatures and docstrings."""
 
 import inspect
+import re
 import shlex
 from collections.abc import Callable
 from importlib import import_module

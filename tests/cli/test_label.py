@@ -2,6 +2,8 @@
 
 import csv
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +13,6 @@ from command_line import refused, run
 from data_sets import contents, save_dataset
 from there import there
 
-from sliplens.errors import InputError
 from sliplens.recordings import (
     Corrections,
     LabelSettings,
@@ -226,9 +227,15 @@ def test_corrections_outside_their_data_set_are_refused_with_their_cure(
     for row, error in cases.items():
         table.write_text(f"trial,bad_frames,slip_s\n{row}\n")
         assert error in refused(capsys, "label", folder, "--no-audit", "--corrections", table)
-    with pytest.raises(InputError, match=r"corrections of .* are {'slip_s': 3}; give such as Corrections\(slip_s="):
-        label_dataset(folder, corrections={trial.trial: {"slip_s": 3}})  # pyright: ignore[reportArgumentType]
-    for data in ([folder], None, 3):
-        with pytest.raises(InputError, match="is no data set; give its folder"):
-            label_dataset(data)  # pyright: ignore[reportArgumentType]
+    # types are checked under pytest only, so that a user's mistake needs another process
+    mistakes = {
+        f"sl.label_dataset({str(folder)!r}, corrections={{{trial.trial!r}: {{'slip_s': 3}}}})": "such as Corrections(",
+        "sl.load_dataset([1])": "[1] is no data set; give its folder",
+    }
+    for call, error in mistakes.items():
+        done = subprocess.run(
+            [sys.executable, "-c", f"import sliplens as sl; {call}"], capture_output=True, text=True, check=False
+        )
+        assert done.stderr.splitlines()[-1].startswith("sliplens.errors.InputError: ")
+        assert error in done.stderr.splitlines()[-1]
     assert contents(folder) == before
