@@ -202,11 +202,11 @@ def removal_units(
     sides = {"pixel": 1, "tile": max(1, round(_TILE_PX * shape[0] / 224))}
     units = {name: [tile_regions(shape, tile_px=side).numpy()] * len(explained.frames) for name, side in sides.items()}
     if all(frame.id in markers for frame in explained.frames):
-        seen = [
+        discs = [
             network_places(markers[frame.id], frame_size=frame_size, image_size=shape[0]) for frame in explained.frames
         ]
         units["marker"] = [
-            marker_regions(shape, torch.from_numpy(centres), radius_px=reach).numpy() for centres, reach in seen
+            marker_regions(shape, torch.from_numpy(centres), radius_px=reach).numpy() for centres, reach in discs
         ]
     return units
 
