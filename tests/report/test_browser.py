@@ -75,7 +75,7 @@ def test_hostile_names_do_nothing_in_figures_of_an_import(window, tmp_path: Path
     write_video(trial, source / "cup.mkv")
     write_forces(trial, source / "cup.csv")
     (source / f"{FILE_NAME}.mkv").write_bytes(b"no video")
-    named = [word for option in ("object", "sensor", "condition") for word in (f"--{option}", ATTACK)]
+    named = [word for option in ("object", "condition") for word in (f"--{option}", ATTACK)]
 
     with pytest.raises(SystemExit):  # what was left out
         main(["import", str(source), "--output", str(tmp_path / "data"), *named, "--no-audit"])

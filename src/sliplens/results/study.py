@@ -331,7 +331,7 @@ class StudyConfig:
     tolerance: float = 0.03
     """Largest error of a prediction in a trial that qualifies, in margin units."""
     tests: tuple[str, ...] = TESTS
-    """Some of `TESTS`."""
+    """Some of `score`, `faithfulness`, `map-quality` and `truth`."""
     seed: int = 0
     """Seed of random orders, new weights and noise."""
     quick: bool = False
