@@ -78,7 +78,7 @@ def test_hostile_names_do_nothing_in_figures_of_an_import(window, tmp_path: Path
     named = [word for option in ("object", "condition") for word in (f"--{option}", ATTACK)]
 
     with pytest.raises(SystemExit):  # what was left out
-        main(["import", str(source), "--output", str(tmp_path / "data"), *named, "--no-audit"])
+        main(["import", str(source), "--output", str(tmp_path / "data"), *named, "--sensor", "tip", "--no-audit"])
 
     said = capsys.readouterr()
     assert "\x1b[2J" not in said.out + said.err
