@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -58,8 +59,9 @@ def images_of(frames: np.ndarray) -> Tensor:
         (lambda values: (values[:, 1],), None),
         (lambda values: {"fx": values[:, 0], "fy": values[:, 1]}, "fy"),
         (lambda values: values, lambda values: values[:, 1]),
+        (lambda values: values, partial(torch.select, dim=1, index=1)),
     ],
-    ids=["vector", "column", "columns", "tuple", "tuple of one", "dict", "function"],
+    ids=["vector", "column", "columns", "tuple", "tuple of one", "dict", "function", "partial"],
 )
 def test_one_of_several_outputs_is_predicted(frames: np.ndarray, make: Callable, output: Output | None):
     module = small_module(3)

@@ -73,8 +73,7 @@ def wrap(
     size
         Height and width of its input, in pixels; frames are resized to it.
     encoding
-        Way to make images of frames: `rgb`, the frame divided by 255, or another encoding, such as
-        `difference`.
+        Way to make images of frames: `rgb`, the frame divided by 255, or another encoding, such as `difference`.
     preprocess
         Differentiable function from images (batch, 3, size, size) in [0, 1] to the module's input, such as
         `torchvision.transforms.Normalize(mean, std)`.
@@ -125,6 +124,7 @@ def wrap(
             f"({type(error).__name__}: {error}); set size= to a number of pixels, preprocess= to a "
             "function, or output= to an output that it has"
         ) from error
+    choice = "" if output is None else getattr(output, "__qualname__", type(output).__qualname__)
     return Network(
         model=model,
         manifest=Manifest(
@@ -138,7 +138,7 @@ def wrap(
             target="output",
             unit=unit,
             # networks of one module with other outputs are different networks
-            weights_sha256=hash_json([hash_weights(module), getattr(output, "__qualname__", output)]),
+            weights_sha256=hash_json([hash_weights(module), output if isinstance(output, int | str) else choice]),
         ),
     )
 

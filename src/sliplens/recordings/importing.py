@@ -278,8 +278,7 @@ def import_recordings(
         If True, add to the data set in `out`. Its trials stay, and so do their splits unless `splits` assigns all of
         them.
     on
-        Where trials are made: `serial` (several side by side in threads), `processes`,
-        `processes=4`, `ray`.
+        Where trials are made: `serial` (several side by side in threads), `processes`, `processes=4`, `ray`.
     **options
         `ImportOptions`. By default the reference is that of the source, else one of the frames before the contact.
 
