@@ -63,7 +63,6 @@ def _average(runs: Sequence[Network], dataset: Dataset, out: Path) -> None:
         novelty=fit_novelty(first.model, train.batches(BATCH), validation.batches(BATCH)),
         metrics={"validation_mse": calibration.mse},
         trained_on=tuple(dict.fromkeys(one for run in runs for one in run.manifest.trained_on)),
-        sequence=None,
         versions=versions(),
     )
     save_checkpoint(out, first.model, manifest)

@@ -3,7 +3,7 @@
 `python .ci/ship.py RUN src/sliplens/weights/NAME --bits 10` keeps so many of the 23 bits behind the point: 10 are
 those of a half-precision number and are stored as one; with more, weights stay float32, whose zeros pack well. RUN may
 be the folder itself. It prints by how much answers on simulated frames move, and refuses more than 0.001 of any: of the
-margin and, where the network has them, of the ratio F_t / F_n, of margins told a friction and of several frames.
+margin and, where the network has it, of the ratio F_t / F_n and of margins at a given friction.
 """
 
 import argparse
@@ -59,9 +59,6 @@ def read(network: Network, trials: list[Recording]) -> dict[str, np.ndarray]:
         for friction in FRICTIONS if network.manifest.traction is not None else ():
             told = network.estimate(inputs, friction=friction)
             parts.setdefault(f"margin told {friction:g}", []).append(told.margin)
-        if network.sequence is not None:
-            several = network.follow().update(estimate, trial.time_s, np.isfinite(trial.safety_margin))
-            parts.setdefault("margin of several frames", []).append(several.margin)
     return {name: np.concatenate(part) for name, part in parts.items()}
 
 
@@ -72,7 +69,7 @@ def ship(run: Path, folder: Path, *, bits: int) -> dict[str, float]:
     kept = {name: rounded(values, bits=bits) for name, values in network.model.state_dict().items()}
     network.model.load_state_dict(kept, assign=True)
     with scratch_folder() as draft:  # what is read back is what ships: a head takes the rounded edges of the bins
-        save_checkpoint(draft, network.model, network.manifest, sequence=network.sequence)
+        save_checkpoint(draft, network.model, network.manifest)
         read_back = read(load(draft), trials)
     changes = {name: float(np.abs(after - before[name]).max()) for name, after in read_back.items()}
     if max(changes.values()) > LARGEST_CHANGE:
@@ -83,7 +80,7 @@ def ship(run: Path, folder: Path, *, bits: int) -> dict[str, float]:
     for name in (RUN_FILE, RESULT_FILE):
         if run.resolve() != folder.resolve():
             shutil.copyfile(run / name, folder / name)
-    save_checkpoint(folder, network.model, network.manifest, sequence=network.sequence)
+    save_checkpoint(folder, network.model, network.manifest)
     if (folder / "readings").is_dir():
         table = load_result(folder / "readings", ReadingTable, command="make weights")
         # of the very network that was rounded: what it reads moves by less than the table resolves

@@ -8,9 +8,7 @@ Friction is unknown; exact; wrong by up to 10 %, as a range of 10 % either way; 
 network predicts F_t / F_n in five frames of the last 0.2 s before the slip of an earlier grasp of the object, whose
 friction lies within a tenth of the object's.
 
-`several`, of a network with a head for sequences: all frames of a trial are predicted in order, with varied pulls (0.8
-to 8 s); `one_of_several` has the same frames one by one, `several_gain` the difference in R2, of fast pulls (less than
-3 s from the first tug to the slip) and slow ones too. `--against` names another network, and prints the lead over it.
+`--against` names another network, and prints the lead over it.
 `--known` measures instead how well the network recognises frames of its own kind of sensor, on days of their own.
 """
 
@@ -49,8 +47,6 @@ DRAWS = {"test": 23, "selection": 21}
 """Seeds of which frames are drawn, and of earlier grasps."""
 BEFORE_SLIP, RATE_HZ, TRIAL_S = 5, 30, 8
 WITHIN = 0.1
-FAST_S = 3.0
-"""A pull that lasts less is fast: about half of the varied ones."""
 KNOWN_DAYS = 10
 RESAMPLES = 2000
 
@@ -273,77 +269,6 @@ def held(truth: np.ndarray, ends: Sequence[tuple[np.ndarray, np.ndarray] | None]
     return float(np.mean(((truth >= low) & (truth <= high))[rows]))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Followed:
-    """Frames of one trial, from touch to end: the truth, what is read of each by itself, and of all in order."""
-
-    day: int
-    wet: bool
-    pull_s: float
-    """From the first tug to the slip."""
-    margin: Float[np.ndarray, " frames"]
-    one: Float[np.ndarray, " frames"]
-    several: Float[np.ndarray, " frames"]
-    in_90: np.ndarray
-
-
-def follow(run: Network, plan: TrialPlan) -> Followed:
-    """Read all frames of a trial with contact."""
-    loading, film = prepare_trial(plan)
-    contact = np.flatnonzero(np.isfinite(loading.safety_margin))
-    frames = film.draw(slice(int(contact[0]), int(contact[-1]) + 1)).numpy()
-    one = run.to_estimate(*run.answers(run.encode(frames, film.draw_reference().numpy()).split(8)))
-    time_s, margin = loading.time_s[contact], loading.safety_margin[contact]
-    several = run.follow().update(one, time_s, np.ones(len(margin), dtype=bool))
-    low, high = several.interval(0.9) or (margin, margin)
-    return Followed(
-        day=plan.day,
-        wet=plan.condition == "wet",
-        pull_s=float(time_s[np.argmax(margin == 0)] - time_s[np.argmax(margin < 1)]),
-        margin=margin,
-        one=one.margin,
-        several=several.margin,
-        in_90=(margin >= low) & (margin <= high),
-    )
-
-
-def follow_all(run: Network, name: str, *, trials: int | None = None) -> list[Followed]:
-    """Read all frames of the trials of a set in order, their pulls varied."""
-    plans = plans_of_set(name, trials=trials)
-    return [follow(run, replace(plan, recipe=replace(plan.recipe, pulls="varied"))) for plan in plans]
-
-
-def joined(read: Sequence[Followed], of: Callable[[Followed], Any]) -> np.ndarray:
-    """Something of each trial, for all of its frames."""
-    return np.concatenate([np.broadcast_to(of(one), len(one.margin)) for one in read])
-
-
-def summarise_sequences(read: Sequence[Followed]) -> dict[str, Any]:
-    """R2 and errors of one frame and of several, dry and wet, and what several gain, in all and by the pull's speed."""
-    found: dict[str, Any] = {"sequence_frames": sum(len(one.margin) for one in read)}
-    for condition, wet in (("dry", False), ("wet", True)):
-        some = [one for one in read if one.wet == wet]
-        margin, day = joined(some, lambda one: one.margin), joined(some, lambda one: one.day)
-        one, several = joined(some, lambda one: one.one), joined(some, lambda one: one.several)
-        fast = joined(some, lambda one: one.pull_s < FAST_S)
-        for name, answer in (("one_of_several", one), ("several", several)):
-            found |= r2_over_days(f"{name}_r2_{condition}", margin, answer, day)
-        found[f"several_in_90_{condition}"] = float(joined(some, lambda one: one.in_90).mean())
-        found[f"fast_trials_{condition}"] = sum(each.pull_s < FAST_S for each in some)
-        for speed, rows in (("", np.ones(len(day), dtype=bool)), ("_fast", fast), ("_slow", ~fast)):
-            if rows.any():
-                found |= lead(f"several_gain_{condition}{speed}", margin, (several, one), day, rows)
-    return found
-
-
-def sequence_leads(read: Sequence[Followed], other: Sequence[Followed]) -> dict[str, float]:
-    """What one network is ahead of another on the same trials, of which both read all frames in order."""
-    margin, day = joined(read, lambda one: one.margin), joined(read, lambda one: one.day)
-    answers = joined(read, lambda one: one.several), joined(other, lambda one: one.several)
-    wet = joined(read, lambda one: one.wet)
-    return lead("several_lead_dry", margin, answers, day, ~wet) | lead("several_lead_wet", margin, answers, day, wet)
-
-
 def measure_known(run: Network, *, trials: int | None = None) -> dict[str, Any]:
     """How well `known` tells frames of other sensors from those of the network's kind, and how often it is low."""
     if run.manifest.novelty is None:
@@ -373,7 +298,6 @@ def main() -> None:
     parser.add_argument("--against", type=Path, help="another network; told is what the first is ahead of it")
     parser.add_argument("--set", choices=SETS, default="test", help="the test, or days on which variants are compared")
     parser.add_argument("--trials", type=int, help="about so many trials, for a quick look")
-    parser.add_argument("--sequences", action="store_true", help="only what several frames tell")
     parser.add_argument("--known", action="store_true", help="only how far it knows its own kind of sensor, and others")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
@@ -381,16 +305,11 @@ def main() -> None:
     found: dict[str, Any] = {"weights_sha256": run.manifest.weights_sha256}
     chosen = {"name": options.set, "trials": options.trials}
     found |= measure_known(run, trials=options.trials) if options.known else {"set": options.set}
-    if not (options.known or options.sequences):
+    if not options.known:
         read = read_frames(run, **chosen)
         found |= summarise(read)
         if other is not None:
             found |= leads(read, read_frames(other, **chosen))
-    if run.sequence is not None and not options.known:
-        followed = follow_all(run, **chosen)
-        found |= summarise_sequences(followed)
-        if other is not None and other.sequence is not None:
-            found |= sequence_leads(followed, follow_all(other, **chosen))
     print(json.dumps(found, indent=None if options.json else 2))
 
 

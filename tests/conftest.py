@@ -4,7 +4,6 @@ import os
 import pickle
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 from data_sets import save_dataset
@@ -14,14 +13,11 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import numpy as np
 import pytest
-import torch
 from dots import draw_dots, make_grid
 from hypothesis import settings
-from small import CALIBRATION, TRACTION, make_recording, save_untrained
+from small import TRACTION, make_recording, save_untrained
 
 from sliplens.images import absolute_difference, write_png
-from sliplens.models import load, save_checkpoint
-from sliplens.models.sequence import SequenceHead, SequenceManifest
 from sliplens.recordings import Dataset, Recording
 from sliplens.runner import EXECUTORS
 from sliplens.simulation import CHROMATOUCH, FLAT_GEL, SimulationRecipe, plan_trials, simulate_trial
@@ -118,20 +114,6 @@ def fine_dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 def ratio_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A network of the ChromaTouch that answers with the margin and with F_t / F_n."""
     return save_untrained(tmp_path_factory.mktemp("ratio-run"), frame_size=224, traction=TRACTION)
-
-
-@pytest.fixture(scope="session")
-def sequence_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A network with two answers and a head for several frames, all of random weights."""
-    folder = save_untrained(tmp_path_factory.mktemp("sequence") / "run", traction=TRACTION)
-    alone = load(folder)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(3)
-        head = SequenceHead(alone.model.get_buffer("edges"), alone.model.get_buffer("ratio_edges"))
-        torch.nn.init.normal_(head.correction.weight)
-    manifest = replace(alone.manifest, sequence=SequenceManifest(calibration=CALIBRATION, mse_one=0.02))
-    save_checkpoint(folder, alone.model, manifest, sequence=head)
-    return folder
 
 
 @pytest.fixture(scope="session")

@@ -81,7 +81,6 @@ MISTAKES = {
     "hold grip:anvil --gripper dry-run": "there is no object named 'anvil'",
     "hold simulated --gripper dry-run --reference one.png two.png": "an image for each source, 1, got 2",
     "hold simulated --gripper dry-run --controller fixed --set speed=3": "has no constant 'speed'",
-    "hold simulated --gripper dry-run --sequence --friction 0.6": "leave out one of them",
     "hold simulated --gripper dry-run --sensor PROFILE": "the run trained-elsewhere does not exist",
     "grip -o OUT --controller magic": "there is no controller named 'magic'",
     "grip -o OUT --condition oily": "there is no condition named 'oily'",

@@ -4,7 +4,6 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,7 +21,6 @@ from sliplens.errors import ImageError
 from sliplens.live.reading import Check, LiveFrame, MarkerReading, Reading, SlipState
 from sliplens.markers import Tracker
 from sliplens.recordings import ContactState, Dataset, Recording
-from sliplens.recordings.source import open_source
 
 
 def watch(read: Callable[[float], MarkerReading]) -> Callable[[np.ndarray], Any]:
@@ -49,29 +47,6 @@ def test_a_reading_is_what_predict_says_of_the_frame(recording: Recording, diffe
         assert reading.withheld is None
         # one frame at a time or many: float32 sums in another order
         assert reading.margin == pytest.approx(np.clip(told[reading.number], 0, 1), abs=1e-4)
-
-
-def test_frames_are_read_in_order_as_predict_reads_them(
-    recording: Recording, small_dataset: Dataset, sequence_run: Path
-):
-    run, [capture] = sl.load(sequence_run), open_source(small_dataset, trial=recording.trial)
-    table = sl.predict(run, [replace(capture, frame_time_s=0.05 * np.arange(12))], sequence=True).to_arrow()
-    source = source_of(recording.frames[1:], range(1, 12))  # nothing touches the first, and it is forgotten
-    readings = source.all_readings(run, reference=recording.reference, sequence=True)
-    assert [reading.number for reading in readings] == list(range(1, 12))
-    assert all(reading.sequence for reading in readings)
-    # one frame at a time or eight: the network's float32 sums differ by 1e-7, and the head's weights of about 1 add 64
-    margins = np.array([reading.margin for reading in readings], dtype=np.float64)
-    np.testing.assert_allclose(margins, np.clip(table["prediction"].to_numpy()[1:], 0, 1), atol=1e-5)
-    alone = sl.predict(run, recording.frames, reference=recording.reference).to_arrow()["prediction"].to_numpy()
-    assert np.abs(margins - alone[1:].clip(0, 1)).max() > 0.01
-
-
-def test_frames_after_a_gap_are_read_by_themselves_and_say_so(recording: Recording, sequence_run: Path):
-    numbers = [1, 2, 3, 20, 21, 22]  # 0.85 s were withheld, or lost
-    source = source_of(recording.frames[1:7], numbers)
-    readings = source.all_readings(sequence_run, reference=recording.reference, sequence=True)
-    assert [reading.sequence for reading in readings] == [True] * 3 + [False] * 3
 
 
 @pytest.mark.parametrize("wait_s", [0.0, 0.01])
@@ -204,14 +179,13 @@ def grasp(time_s: float) -> MarkerReading:
     return MarkerReading(state=SlipState.STICKING, contact=True, slipped_s=0.06 if place == 3 else None)
 
 
-@pytest.mark.parametrize("sequence", [False, True])
 @pytest.mark.parametrize("same_object", [False, True])
 def test_a_slip_teaches_the_next_grasp_of_the_same_object_until_there_is_another(
-    trials: dict[str, Recording], *, same_object: bool, sequence: bool
+    trials: dict[str, Recording], *, same_object: bool
 ):
     trial = trials["chromatouch"]
     images = np.tile(trial.frames[10:15], (3, 1, 1, 1))
-    options = {"same_object": same_object, "sequence": sequence, "slip": watch(grasp)}
+    options = {"same_object": same_object, "slip": watch(grasp)}
     reader = plain_reader(source := source_of(images), "chromatouch-difference", reference=trial.reference, **options)
 
     def hear(reading: Reading, _: object) -> None:
@@ -222,13 +196,10 @@ def test_a_slip_teaches_the_next_grasp_of_the_same_object_until_there_is_another
 
     reader.subscribe(hear)
     readings = source.all_readings(reader)
-    friction, kept = ([getattr(reading, name) for reading in readings] for name in ("friction", "sequence"))
+    friction = [reading.friction for reading in readings]
     first, second, third = friction[:4], friction[5:9], friction[10:14]
     assert set(first) == set(third) == {None}
     assert all("learnt from slips" in str(one) for one in second) if same_object else set(second) == {None}
-    # in order where nothing is known
-    assert kept[:4] == kept[10:14] == [sequence] * 4
-    assert kept[5:9] == [sequence and not same_object] * 4
 
 
 def test_a_network_of_another_sensor_is_refused_before_anything_runs(difference_run: Path):

@@ -22,7 +22,7 @@ def test_every_network_of_the_package_loads_and_says_what_it_learned_from(name: 
     trained = sliplens.load(name)
     assert not trained.model.training
     assert trained.manifest.input == name.rpartition("-")[2]
-    assert trained.manifest.data_hash
+    assert trained.manifest.trained_on
     assert trained.manifest.metrics["validation_mse"] < 1 / 12  # that of a constant, of margins spread evenly
     assert find_run(Path(name)).name == name
     assert sum(path.stat().st_size for path in find_run(Path(name)).iterdir()) < 8e6
@@ -64,19 +64,16 @@ def test_it_reads_a_simulated_grip_in_the_right_order(name: str, request: pytest
         assert error < 0.5
 
 
-def test_several_frames_are_read_better_than_one_and_the_ratio_better_than_chance(pulls: list[Recording]):
-    """By how much, `benchmarks/networks.py` measures; an untaught head reads as one frame does."""
+def test_the_ratio_is_predicted_better_than_chance(pulls: list[Recording]):
+    """By how much, `benchmarks/networks.py` measures."""
     trained, columns = sliplens.load("chromatouch-difference"), []
     for trial in pulls:
         rows = np.flatnonzero(trial.labelled)
         one = trained.estimate(trained.encode(trial.frames[rows], trial.reference))
-        several = trained.follow().update(one, trial.time_s[rows], np.ones(len(rows), dtype=bool))
         ratio = trial.tangential_force_n[rows] / trial.normal_force_n[rows]
         assert one.ratio is not None
-        columns.append(np.stack([trial.safety_margin[rows], one.margin, several.margin, ratio, one.ratio.mean]))
-    label, one, several, ratio, read = np.concatenate(columns, axis=1)
-    # of the trials of three seeds it was 0.71, 0.48 and 0.34
-    assert np.mean((several - label) ** 2) < 0.85 * np.mean((one - label) ** 2)
+        columns.append(np.stack([ratio, one.ratio.mean]))
+    ratio, read = np.concatenate(columns, axis=1)
     assert np.mean((read - ratio) ** 2) < 0.2 * ratio.var()
 
 

@@ -408,7 +408,6 @@ function tellFacts() {
     latency: `${ms(latency.total_ms)} to the reading (${parts.join(", ")})`,
     contact: words?.contact ?? "unknown",
     friction: reading?.friction ? `taken for ${reading.friction}` : "",
-    "read in order": reading?.sequence ? "earlier frames of the contact count" : "",
   };
   const shown = Object.entries(rows).filter(([, value]) => value).flat();
   while ($.facts.children.length > shown.length) $.facts.lastChild.remove();

@@ -484,8 +484,6 @@ class HoldOptions(TypedDict, total=False):
     """Coefficient of friction of the object, if it is known: 0.62, 0.5..0.8 or 0.58+-0.05."""
     same_object: bool
     """All grasps are of one object: friction measured in a slip holds for the next."""
-    sequence: bool
-    """Predict frames in order, with those before; for a network of the recipe sequence."""
     sensor: str
     """Profile of the sensors, a file or a name such as digit."""
     engine: Literal["auto", "torch", "openvino"]

@@ -177,8 +177,6 @@ def print_scores(evaluation: "Evaluation") -> None:
     print_table(f"{evaluation.input} images, {evaluation.split} trials; 90 %: labels within this interval", rows)
     if evaluation.friction:
         say(f"friction: {evaluation.friction}")
-    if evaluation.sequence:
-        say("sequence: each margin is predicted from the frames of its contact so far")
     if evaluation.ratio_r2:
         scores = (f"{name} {'none' if r2 is None else f'{r2:.3f}'}" for name, r2 in evaluation.ratio_r2.items())
         say(f"F_t / F_n is predicted with R2 {', '.join(scores)}")

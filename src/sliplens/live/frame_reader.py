@@ -21,7 +21,6 @@ from sliplens.markers import Tracker
 from sliplens.models.checkpoint import Network
 from sliplens.models.engines import Engine
 from sliplens.models.predictions import LEVEL
-from sliplens.models.sequence import require_frequent
 from sliplens.recordings.capture import Frame
 from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.trial import ContactState, contact_states
@@ -45,9 +44,6 @@ class ReaderSettings(TypedDict, total=False):
     same_object: bool
     """If True, every grasp is of one object, until `new_object`: the friction that a slip taught counts in later
     grasps."""
-    sequence: bool
-    """If True, the earlier frames of a contact count, as `predict` takes it. Health and markers show when a contact
-    ends: without both, all frames count as one."""
     engine: str
     """`torch`, `openvino`, or `auto`, the default, for the fastest that pays for `seconds`, or for hours without it."""
     device: str
@@ -114,12 +110,8 @@ class FrameReader:
         """
         self.learner: SlipLearner
         """Friction that was set, and that slips teach."""
-        friction, sequence = settings.get("friction"), settings.get("sequence", False)
         self._same_object = settings.get("same_object", False)
-        self.new_object(friction)
-        if sequence and network is None:
-            raise InputError("--sequence needs a network; name one with --network")
-        self._follower = network.follow(friction=friction) if network is not None and sequence else None
+        self.new_object(settings.get("friction"))
         self._make_health, self._make_slip = settings.get("health", HealthMonitor), settings.get("slip", SlipDetector)
         self._health: HealthMonitor | None = None
         self._shear: ShearEstimator | None = None
@@ -155,8 +147,6 @@ class FrameReader:
     def begin(self, engine: Engine | None, reference: Frame | None, *, size: tuple[int, int] | None = None) -> None:
         """Prepare for frames of the open source, of its size if None, with an image of the untouched sensor if any."""
         self.engine, self._size = engine, size or self.source.size
-        if self._follower is not None and self.source.rate_hz:
-            require_frequent(np.arange(2) * self.source.speed / self.source.rate_hz, what=self.source.name)
         if reference is None:
             self.taker = ReferenceTaker()
             return
@@ -251,8 +241,6 @@ class FrameReader:
         if not touches:
             withheld = withheld or (None if self.network is None else _NO_CONTACT)
             reading = replace(reading, contact_state=ContactState.NO_CONTACT, withheld=withheld)
-            if self._follower is not None:
-                self._follower.forget()
         slipping_s = None if markers is None else markers.slipped_s  # of a pull that was let go it is None
         self.learner.update(frame.time_s, slipping_s=slipping_s, touches=touches)
         return reading
@@ -262,15 +250,12 @@ class FrameReader:
         if reading.withheld is not None:
             return reading
         friction = self.learner.friction
-        follower = self._follower if friction is None else None  # it takes no friction
         estimate = network.to_estimate(*parts, friction=friction)
         novelty = None if self._health is None else check_novelty(estimate)
         if novelty is not None:
             reading = replace(reading, health=(*reading.health, novelty))
             if not novelty.ok:
                 return replace(reading, withheld=novelty.sentence)
-        if follower is not None:
-            estimate = follower.update(estimate, np.array([frame.time_s]), np.array([True]))
         ratio = None if estimate.ratio is None else float(estimate.ratio.mean[0])
         if ratio is not None and estimate.ratio is not None:
             self.learner.note(ratio, sigma=float(estimate.ratio.sigma[0]), time_s=frame.time_s)
@@ -290,7 +275,6 @@ class FrameReader:
             high=high,
             ratio=ratio,
             friction=None if friction is None else str(friction),
-            sequence=follower is not None and not follower.lost,
             risk=margin_risk(reading.health, float(estimate.beyond(OFF)[0])) if reading.health else None,
             contact_state=state,
         )
@@ -307,8 +291,6 @@ class FrameReader:
         """Forget earlier frames, where frames no longer follow each other."""
         self.learner.release()
         self._last = None
-        if self._follower is not None:
-            self._follower.forget()
         self.markers_px = None
         if self._make_slip is not None and self.reference is not None:
             try:

@@ -139,8 +139,6 @@ class Reading:
     """Traction ratio F_t / F_n, of a network that predicts it."""
     friction: str | None = None
     """Coefficient of friction that the margin assumes, in words; None where none was set."""
-    sequence: bool = False
-    """True where the earlier frames of the contact count too."""
     risk: float | None = None
     """Chance that the margin is off by more than 0.2 (`margin_risk`); None without a margin."""
     contact_state: ContactState = ContactState.UNKNOWN

@@ -5,9 +5,8 @@ from sliplens.models.checkpoint import Estimate, Manifest, Network, Ratio, load,
 from sliplens.models.engines import ENGINES, Engine, make_engine, prepare
 from sliplens.models.onnx import export_onnx
 from sliplens.models.predictions import Predictions, predict
-from sliplens.models.sequence import Follower
 
 __all__ = [
-    "ENGINES", "Engine", "Estimate", "Follower", "Manifest", "Network", "Predictions", "Ratio", "build_model",
+    "ENGINES", "Engine", "Estimate", "Manifest", "Network", "Predictions", "Ratio", "build_model",
     "export_onnx", "load", "make_engine", "predict", "prepare", "save_checkpoint",
 ]  # fmt: skip

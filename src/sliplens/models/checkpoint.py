@@ -6,11 +6,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from math import cos, erfc, radians, sin, sqrt
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, Shaped, UInt8
+from jaxtyping import Bool, Float, Shaped, UInt8
 from msgspec import Meta
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
@@ -34,7 +34,6 @@ from sliplens.models.backbones import (
 from sliplens.models.calibration import Calibration, Traction, condition_on_friction, raw_interval, standard_deviation
 from sliplens.models.encodings import ENCODINGS, Encoding
 from sliplens.models.novelty import Novelty
-from sliplens.models.sequence import Follower, SequenceHead, SequenceManifest
 from sliplens.progress import number_of
 from sliplens.recordings.sensor import SensorProfile
 from sliplens.results.evaluation import Training
@@ -43,7 +42,7 @@ from sliplens.shear import FULL_CIRCLE, Shear, ShearEstimator, range_words
 if TYPE_CHECKING:
     from sliplens.models.engines import Engine
 
-WEIGHTS_FILE, SEQUENCE_FILE = "model.safetensors", "sequence.safetensors"
+WEIGHTS_FILE = "model.safetensors"
 MODULE = "module"
 """`Manifest.head` of a wrapped module."""
 LARGEST_INPUT = 4096  # pixels along a side, several times what any backbone was made for
@@ -74,8 +73,6 @@ class Manifest:
     """Calibration of the second output, F_t / F_n; None for a network that predicts the margin alone."""
     novelty: Novelty | None = None
     """Distribution of its training frames in its features; None if never fitted."""
-    sequence: SequenceManifest | None = None
-    """Calibration of the head for several frames; None without such a head."""
     pull_direction_deg: tuple[float, float] | None = None
     """Directions in which its training trials were pulled, lowest and highest: 0 is right, 90 down the image, (0, 360)
     all. None if unknown."""
@@ -107,8 +104,6 @@ class Network:
     manifest: Manifest
     training: Training | None = None
     """Record of its training, with the learning curve; None if its folder has none."""
-    sequence: SequenceHead | None = None
-    """Head for several frames, see `follow`; None without such a head."""
 
     def __repr__(self) -> str:
         """Describe the network in a few lines; the layers are in `model`."""
@@ -283,18 +278,6 @@ class Network:
             return estimate
         return estimate.with_friction(as_friction(friction), self.require_ratio())
 
-    def follow(self, *, friction: object = None) -> Follower:
-        """Make a corrector of predictions for the frames of a sensor in order; it takes no `friction`."""
-        manifest = self.manifest.sequence
-        if friction is not None:
-            raise InputError("--sequence estimates the friction, and --friction sets it; leave out one of them")
-        if self.sequence is None or manifest is None:
-            raise InputError(
-                "this network has no head for several frames; leave out --sequence, or teach it with `sliplens train "
-                "DATA -o RUN --start-from NETWORK --recipe sequence`"
-            )
-        return Follower(self.sequence, manifest)
-
     def require_ratio(self) -> Traction:
         """Return the calibration of F_t / F_n, without which a friction cannot be used."""
         if self.manifest.traction is None:
@@ -350,17 +333,6 @@ class Estimate:
     """Share of the network's validation frames that were as strange or stranger, in its features or in the spread of
     its prediction, from 0 to 1 (`Novelty.known`). None for a network without a `Novelty`. It does not warn of an
     unknown friction."""
-    alone: tuple[Bool[np.ndarray, " frames"], Calibration | None] | None = None
-    """Frames, of those predicted in order, that keep the prediction of a single frame, and their calibration; None
-    where all have the same calibration."""
-
-    def at(self, rows: Int[np.ndarray, " rows"] | Bool[np.ndarray, " frames"]) -> "Estimate":
-        """Select frames."""
-        ratio = self.ratio and replace(self.ratio, probabilities=self.ratio.probabilities[rows])
-        alone = self.alone and (self.alone[0][rows], self.alone[1])
-        values = {name: getattr(self, name) for name in ("margin", "probabilities", "known")}
-        parts = {name: value[rows] for name, value in values.items() if value is not None}
-        return replace(self, ratio=ratio, alone=alone, **parts)
 
     @property
     def sigma(self) -> Float[np.ndarray, " frames"] | None:
@@ -393,10 +365,7 @@ class Estimate:
         """Return an interval for each margin at a level of confidence, within [0, 1]; None if not calibrated."""
         if self.calibration is None:
             return None
-        offset: Any = pick(self.calibration.offsets, str(level), noun="level")
-        if self.alone is not None and self.alone[1] is not None:
-            single = self.alone[1].offsets.get(str(level), offset)  # calibrations may have other levels
-            offset = np.where(self.alone[0], single, offset)
+        offset = pick(self.calibration.offsets, str(level), noun="level")
         low, high = raw_interval(self.margin, self.probabilities, self.edges, level)
         # a label lies in [0, 1], so cutting there loses none
         return np.clip(low - offset, 0, 1), np.clip(high + offset, 0, 1)
@@ -429,7 +398,6 @@ class Estimate:
             probabilities=probabilities,
             calibration=traction.known_friction,
             friction=friction if common else None,
-            alone=None,
         )
 
 
@@ -443,22 +411,12 @@ def hash_weights(model: nn.Module) -> str:
     return digest.hexdigest()
 
 
-def save_checkpoint(
-    folder: Path, model: nn.Module, manifest: Manifest, *, sequence: SequenceHead | None = None
-) -> None:
+def save_checkpoint(folder: Path, model: nn.Module, manifest: Manifest) -> None:
     """Write weights and manifest into a folder; the manifest, which makes it a checkpoint, comes last."""
-    if manifest.sequence is not None and sequence is not None:
-        hashed = _save_weights(folder / SEQUENCE_FILE, sequence)
-        manifest = replace(manifest, sequence=replace(manifest.sequence, weights_sha256=hashed))
-    hashed = _save_weights(folder / WEIGHTS_FILE, model)
-    write_json(folder / MANIFEST_FILE, replace(manifest, weights_sha256=hashed))
-
-
-def _save_weights(path: Path, model: nn.Module) -> str:
     values = save({name: value.detach().cpu().contiguous() for name, value in model.state_dict().items()})
-    with whole_file(path) as part:
+    with whole_file(folder / WEIGHTS_FILE) as part:
         part.write_bytes(values)
-    return hash_file(path)
+    write_json(folder / MANIFEST_FILE, replace(manifest, weights_sha256=hash_file(folder / WEIGHTS_FILE)))
 
 
 def _load_weights(path: Path, model: nn.Module, *, what: str, sha256: str) -> None:
@@ -512,17 +470,13 @@ def load(run: str | Path, *, device: str = "cpu") -> Network:
     folder = find_run(Path(run))
     require_folder(folder, what="the run")
     manifest = read_manifest(folder)
-    encoding, sequence = pick(ENCODINGS, manifest.input, noun="input"), None
-    model = build_model(manifest.backbone, head=manifest.head, colours=encoding.colours)
+    colours = pick(ENCODINGS, manifest.input, noun="input").colours
+    model = build_model(manifest.backbone, head=manifest.head, colours=colours)
     what = f"a {manifest.backbone} with a {manifest.head} head"
     _load_weights(folder / WEIGHTS_FILE, model, what=what, sha256=manifest.weights_sha256)
-    if manifest.sequence is not None:
-        sequence = SequenceHead(model.get_buffer("edges"), model.get_buffer("ratio_edges")).eval()
-        hashed = manifest.sequence.weights_sha256
-        _load_weights(folder / SEQUENCE_FILE, sequence, what="a head of several frames", sha256=hashed)
     # channels last: depthwise convolutions run up to half as fast again on a CPU
     model = model.to(device, memory_format=torch.channels_last).eval()  # pyright: ignore[reportCallIssue]
     # the networks of the package come without their learning curve
     has_curve = (folder / "curve.parquet").is_file()
     training = load_result(folder, Training, command="sliplens train") if has_curve else None
-    return Network(model=model, manifest=manifest, training=training, sequence=sequence)
+    return Network(model=model, manifest=manifest, training=training)

@@ -23,7 +23,6 @@ from sliplens.images import LEAST_TOUCH, Images, picture_change, soften
 from sliplens.markers.camera import CAMERA_LIMIT_PX, CAMERA_REASON, CameraWatch
 from sliplens.models.checkpoint import Estimate, Network
 from sliplens.models.engines import Engine, make_engine
-from sliplens.models.sequence import require_frequent
 from sliplens.models.wrapping import Preprocess, open_run
 from sliplens.progress import OnProgress, add_note, number_of, open_stage, report_progress, reporting
 from sliplens.recordings import Dataset, load_dataset
@@ -141,7 +140,6 @@ def predict(
     source: Path | str | Dataset | Sequence[Capture] | Images | None = None,
     *,
     friction: FrictionLike | None = None,
-    sequence: bool = False,
     engine: str = "auto",
     batch_size: int = 8,
     device: str = "cpu",
@@ -164,9 +162,6 @@ def predict(
     friction
         Coefficient of friction of the object, for a network that predicts F_t / F_n: a number, (low, high), or a
         `Friction`, such as one learnt from slips (docs/networks.md). If None, any friction of the training is possible.
-    sequence
-        If True, predict each trial in order and correct a frame by the frames of its contact before it (`Follower`).
-        It needs the times of the frames, and no `friction`.
     engine
         `torch`, `openvino`, or `auto` for OpenVINO where it is installed and the frames are many.
     batch_size
@@ -246,7 +241,7 @@ def predict(
             add_note(f"no network was named, so {name} reads it, {origin}")
             network = open_run(name, device=device)
         kinds = [_assume_reference(network, capture) for capture in trials.kinds]
-        notes = _list_notes(network, kinds, profile, friction=prior, sequence=sequence)
+        notes = _list_notes(network, kinds, profile, friction=prior)
         for sentence in notes:
             add_note(sentence)
         metadata = {
@@ -256,16 +251,14 @@ def predict(
         }
         if prior is not None:
             metadata["sliplens.friction"] = str(prior)
-        if sequence and network.manifest.sequence is not None:
-            metadata["sliplens.sequence"] = network.manifest.sequence.weights_sha256
         schema = _schema(network, kinds, metadata)
         make = partial(make_engine, engine, network, frames=trials.frames, batch_size=batch_size)
         recipe = {"frames": trials.frames, "batch_size": batch_size, "engine": engine, **metadata}
         recipe |= {"columns": schema.names, "device": str(network.device), "source": trials.recipe}
         recipe["friction"] = prior and prior.digest
         written, rows = run_table(
-            _Prediction(network=network, trials=trials, schema=schema, friction=prior, sequence=sequence, make=make),
-            trials.parts(recipe, longest=None if sequence else LONGEST),
+            _Prediction(network=network, trials=trials, schema=schema, friction=prior, make=make),
+            trials.parts(recipe),
             path,
             title=f"Predicting frames ({network.manifest.input})",
             recipe=recipe,
@@ -278,28 +271,17 @@ def predict(
 
 
 def _list_notes(
-    network: Network,
-    captures: Sequence[Capture],
-    profile: SensorProfile | None,
-    *,
-    friction: Friction | None,
-    sequence: bool,
+    network: Network, captures: Sequence[Capture], profile: SensorProfile | None, *, friction: Friction | None
 ) -> tuple[str, ...]:
     """Refuse recordings and options that do not fit the network; return the assumptions about those that do."""
     if friction is not None:
         network.require_ratio()
-    if sequence:
-        network.follow(friction=friction)
     notes: list[str] = []
     for capture in captures:
-        if sequence:
-            require_frequent(capture.time_s, what=capture.trial)
         notes += [*capture.notes, *_require_comparable(network, capture)]
     notes += network.doubts(profile=profile)
     if friction is not None:
         notes += [f"The coefficient of friction is taken for {friction}.", *network.doubts(friction=friction)]
-    if sequence:
-        notes.append("Frames were read in order: each answer counts those of its contact before it.")
     return tuple(dict.fromkeys(notes))
 
 
@@ -374,7 +356,6 @@ class _Prediction(Work):
     trials: Trials
     schema: pa.Schema
     friction: Friction | None
-    sequence: bool
     make: Callable[[], Engine]
 
     @property
@@ -390,9 +371,7 @@ class _Prediction(Work):
         _, first, count = part
         capture, frames = read(*part)
         capture = _assume_reference(self.network, capture)
-        network, follower = self.network, self.network.follow() if self.sequence else None
-        if self.sequence:
-            require_frequent(capture.time_s, what=capture.trial)  # `_list_notes` saw one trial of each sensor
+        network = self.network
         reference = None if capture.read_reference is None else capture.read_reference()
         check, size = _make_check(network, capture, reference), tuple(network.manifest.frame_size)
         encode = partial(network.encoding.encode, reference=reference, image_size=network.manifest.image_size)
@@ -418,9 +397,6 @@ class _Prediction(Work):
             ]
             believed = np.array([reason is None for reason in withheld])
             here = slice(begin, begin + len(checks))
-            if follower is not None:
-                assert capture.time_s is not None  # `_list_notes`
-                estimate = follower.update(estimate, capture.time_s[here], touches, believed=believed)
             columns = _columns(estimate, capture, here, believed=believed) | {"touches": touches, "withheld": withheld}
             yield pa.table(
                 [

@@ -208,8 +208,6 @@ class Evaluation(Result):
     predictions: ScoredFrames
     friction: str = ""
     """Coefficient of friction that the margins are conditioned on; empty if none."""
-    sequence: bool = False
-    """True if each margin was predicted from the frames of its contact so far, not from a single frame."""
     ratio_r2: dict[str, float | None] = field(default_factory=dict)
     """R2 of the traction ratio F_t / F_n by condition; empty for a network that answers with the margin alone, None
     where the ratio does not vary or no force is known."""

@@ -49,11 +49,10 @@ class TrainingConfig:
     augmentation: str = "default"
     untouched_share: float = 0.05
     """Images of the untouched sensor, as full stick, for each labelled frame."""
-    learns: Literal["all", "weights", "ratio", "sequence"] = "all"
+    learns: Literal["all", "weights", "ratio"] = "all"
     """Parameters that change. all: weights, and the statistics of batch normalisation. weights: the weights alone.
     ratio: the rows of the last layer that predict F_t / F_n, so that margins stay to the bit; the inputs of that layer
-    are computed once, without augmentation. sequence: a head that predicts the margin from the outputs for several
-    frames; `batch_size` then counts trials."""
+    are computed once, without augmentation."""
     epoch_frames: int | None = None
     """Images of an epoch, drawn from all; each frame once if None."""
     patience: int | None = None
@@ -109,15 +108,6 @@ RECIPES = {
     "ratio": TrainingConfig(
         recipe="ratio", head="margin-and-ratio", epochs=20, weight_decay=0.0, augmentation="none", learns="ratio"
     ),
-    "sequence": TrainingConfig(
-        recipe="sequence",
-        head="margin-and-ratio",
-        epochs=60,
-        batch_size=32,
-        learning_rate=3e-3,
-        augmentation="none",
-        learns="sequence",
-    ),
     "adapt": TrainingConfig(
         recipe="adapt",
         head="histogram",
@@ -132,8 +122,7 @@ RECIPES = {
 """`thesis` is that of Polak, section 4: ShuffleNetV2 x1.0 from scratch, one output, Ranger21 with its defaults, mean
 squared error, 25 epochs, batches of 124, 224 x 224 pixels, a learning rate of 8e-4, mixed precision, the best
 checkpoint on validation, rotation, noise and blur. `default` is ours; docs/networks.md has the reasons. `ratio` teaches
-an existing network its second output, F_t / F_n, `sequence` a head for several frames, and `adapt` another sensor from
-few trials, all in minutes."""
+an existing network its second output, F_t / F_n, and `adapt` another sensor from few trials, both in minutes."""
 
 
 def make_logger(logger: Logger | str, folder: Path) -> Logger | None:

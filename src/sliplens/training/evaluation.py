@@ -1,6 +1,6 @@
 """Evaluation of a network on labelled trials: errors, coverage, warnings."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,8 +12,6 @@ from sliplens.errors import RecordingError
 from sliplens.files import output_folder
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.models import Network
-from sliplens.models.checkpoint import Estimate
-from sliplens.models.sequence import require_frequent
 from sliplens.models.wrapping import open_run
 from sliplens.progress import OnProgress, add_note, open_stage, report_file, reporting
 from sliplens.recordings import Dataset
@@ -39,7 +37,6 @@ def evaluate(
     *,
     split: str = "test",
     friction: FrictionLike | None = None,
-    sequence: bool = False,
     overwrite: bool = False,
     on_progress: OnProgress | None = None,
 ) -> Evaluation:
@@ -58,8 +55,6 @@ def evaluate(
     friction
         Coefficient of friction, as `predict` takes it; `each` takes that of every trial from its labels. It needs a
         network that predicts F_t / F_n.
-    sequence
-        If True, predict each trial in order, as `predict` does; frames without a label are left out.
     overwrite
         If True, replace a folder `out` of other settings.
     on_progress
@@ -81,8 +76,6 @@ def evaluate(
     prior = None if friction is None else EACH if friction == EACH else as_friction(friction)
     if prior is not None:
         network.require_ratio()
-    if sequence:
-        network.follow(friction=prior)
     data = data if isinstance(data, Dataset) else load_dataset(data)
     trials = data.select(split=split)
     for trial in trials:
@@ -92,7 +85,7 @@ def evaluate(
         with open_stage(f"Reading {split} trials ({network.manifest.input})"):
             frames = load_frames(data, trials, encoding=network.encoding, image_size=network.manifest.image_size)
         with open_stage("Predicting frames"):
-            evaluation = evaluate_frames(network, frames, split=split, friction=prior, sequence=sequence)
+            evaluation = evaluate_frames(network, frames, split=split, friction=prior)
         # trials that trained or validated the network, or the one it started from, by hashes of their files
         return replace(
             evaluation, known_trials=sum(trial.sha256[:12] in network.manifest.trained_on for trial in trials)
@@ -112,7 +105,6 @@ def evaluate(
             "input": network.manifest.input,
             "split": split,
             "friction": prior.digest if isinstance(prior, Friction) else prior,
-            "sequence": network.manifest.sequence if sequence else None,
         }
         with output_folder(Path(out), stage="evaluate", config=recipe, overwrite=overwrite) as output:
             if output.complete:
@@ -125,20 +117,12 @@ def evaluate(
 
 
 def evaluate_frames(
-    network: Network,
-    frames: FrameSet,
-    *,
-    split: str = "test",
-    friction: FrictionLike | None = None,
-    sequence: bool = False,
+    network: Network, frames: FrameSet, *, split: str = "test", friction: FrictionLike | None = None
 ) -> Evaluation:
     """Predict the frames of `load_frames`, and score the predictions for each condition and trial.
 
-    `friction` (a coefficient) and `sequence` as `evaluate` takes them.
+    `friction`: a coefficient, as `evaluate` takes it.
     """
-    names = np.array(frames.trial)
-    for name in np.unique(names) if sequence else ():
-        require_frequent(np.sort(frames.time_s[names == name]), what=f"the trial {name}")
     batches = frames.batches(64, report=True)
     if friction == EACH:
         traction = network.require_ratio()
@@ -147,8 +131,6 @@ def evaluate_frames(
         estimate = network.estimate(batches).with_friction(frames.friction, traction)
     else:
         estimate = network.estimate(batches, friction=friction)
-    if sequence:
-        estimate = _follow_trials(network, estimate, frames.trial, frames.time_s)
     levels = estimate.calibration.offsets if estimate.calibration else ()
     intervals = {level: ends for level in levels if (ends := estimate.interval(float(level)))}
     unknown, sigma = np.full(len(frames), np.nan), estimate.sigma
@@ -194,24 +176,9 @@ def evaluate_frames(
             np.abs(predictions.prediction - predictions.safety_margin),
             {"known": estimate.known, "spread": None if sigma is None else -sigma},
         ),
-        sequence=sequence,
         friction="that of each trial, given exactly" if friction == EACH else str(estimate.friction or ""),
         ratio_r2=ratio_r2,
     )
-
-
-def _follow_trials(
-    network: Network, estimate: Estimate, trial: Sequence[str], time_s: Float[np.ndarray, " frames"]
-) -> Estimate:
-    """Correct the frames of each trial in the order of their times (`Follower`); all of them touch."""
-    _, number = np.unique(np.array(trial), return_inverse=True)
-    start_s = np.full(number.max() + 1, np.inf)
-    np.minimum.at(start_s, number, time_s)
-    passed_s = time_s - start_s[number]
-    order = np.lexsort((passed_s, number))
-    clock_s = passed_s - number * (passed_s.max() + 1)  # runs back from trial to trial, which clears the memory
-    followed = network.follow().update(estimate.at(order), clock_s[order], np.ones(len(order), dtype=bool))
-    return followed.at(np.argsort(order))
 
 
 def _r2(truth: Float[np.ndarray, " _"], predicted: Float[np.ndarray, " _"]) -> float | None:

@@ -55,19 +55,13 @@ from sliplens.training.module import (
     make_trainer,
     run_trainer,
 )
-from sliplens.training.sequence import fit_sequence
 
 _KIND = {
     "all": ("backbone", "head"),
     "weights": ("backbone", "head", "image_size"),
     "ratio": ("backbone", "image_size"),
-    "sequence": ("backbone", "head", "image_size"),
 }
 """Properties that a network keeps from the network it starts from, by `TrainingConfig.learns`."""
-_KEEP_PREDICTIONS = {"ratio", "sequence"}
-"""Values of `learns` that leave the predictions of the network to start from as they are."""
-_SEQUENCE_TAKES = {"epochs", "batch_size", "learning_rate", "weight_decay", "seed"}
-"""Settings that apply to the training of a head for several frames."""
 _DIRECTION_TRIALS, _DIRECTION_FRAMES, _LEAST_DIRECTIONS = 40, 5, 3
 """Trials and frames of each from which the directions of the pulls are estimated, at most, and trials at least."""
 _PULLED, _SURE, _DIRECTION_MARGIN_DEG = 0.6, 5.0, 10.0
@@ -92,8 +86,7 @@ def train(
 ) -> Network:
     """Train a network on a data set, and keep the weights that are best on its validation trials.
 
-    Interrupted, it continues after the last whole epoch when it is called again with the same `out`; the recipe
-    `sequence`, of minutes, begins anew.
+    Interrupted, it continues after the last whole epoch when it is called again with the same `out`.
 
     Parameters
     ----------
@@ -105,7 +98,7 @@ def train(
         Input of the network: `difference`, `raw`, `rgb`, `signed`, `amplitude` or `pair`; by default that of
         `start_from`, else `difference`.
     recipe
-        `default`, `thesis`, `ratio`, `sequence` or `adapt`.
+        `default`, `thesis`, `ratio` or `adapt`.
     start_from
         Network whose weights to start from, its folder, or the name of one that comes with sliplens: to teach it
         another sensor, or to go on at another image size. It keeps its input, backbone and head.
@@ -152,11 +145,9 @@ def train(
     trainer = make_trainer(config, accelerator=accelerator)
     if start is not None:
         require_same_kind(start, config, input)
-    if config.learns == "sequence" and logger != "csv":
-        raise InputError("a head of several frames writes metrics.csv alone; leave out --logger")
     data = data if isinstance(data, Dataset) else load_dataset(data)
     encoding, trials = pick(ENCODINGS, input, noun="input"), _choose_trials(data, condition)
-    grown = start is not None and config.head == "margin-and-ratio" and config.learns not in _KEEP_PREDICTIONS
+    grown = start is not None and config.head == "margin-and-ratio" and config.learns != "ratio"
     if grown and "head" not in changes:
         # the second output is left out where the labels do not show the ratio
         labelled = all(any(has_ratio(data.read_labels(info)) for info in some) for some in trials)
@@ -165,8 +156,6 @@ def train(
     origin |= {} if start is None else {"started_from": start.manifest.weights_sha256}
 
     def run(folder: Path, opened: Logger | None = None) -> Training:
-        if start is not None and config.learns == "sequence":
-            return replace(fit_sequence(config, start, data, trials, folder), condition=condition)
         load_some = partial(load_frames, data, encoding=encoding, image_size=config.image_size, scratch=folder)
         with open_stage(f"Reading training trials ({encoding.name})"):
             train_frames = load_some(trials[0], untouched_share=config.untouched_share)
@@ -192,8 +181,6 @@ def train(
     with reporting(on_progress):
         if start is not None and start.manifest.head == "margin-and-ratio" and config.head == "histogram":
             add_note("the labels have no forces and friction, so the network learns the margin alone: no --friction")
-        elif start is not None and start.sequence is not None and config.learns != "sequence":
-            add_note("the head for several frames of --start-from is left out; train another by --recipe sequence")
         if out is None:
             with scratch_folder() as folder:
                 training = run(folder)
@@ -221,9 +208,8 @@ def _configure(recipe: str, changes: TrainingChanges, start: Network | None) -> 
             raise InputError(f"the recipe {recipe} teaches an existing network; name it with --start-from")
         return config
     fixed = {name: getattr(start.manifest, name) for name in _KIND[config.learns]}
-    allowed = changes if config.learns != "sequence" else _SEQUENCE_TAKES | fixed.keys()
-    wrong = [name for name, value in changes.items() if name not in allowed or value != fixed.get(name, value)]
-    if wrong and config.learns in _KEEP_PREDICTIONS:
+    wrong = [name for name, value in changes.items() if value != fixed.get(name, value)]
+    if wrong and config.learns == "ratio":
         options = ", ".join(f"--{name.replace('_', '-')}" for name in sorted(wrong))
         raise InputError(f"the recipe {recipe} leaves the network of --start-from as it is; leave out {options}")
     return replace(config, **fixed | changes)
@@ -254,7 +240,7 @@ def trained_directions(
 
     None where too few trials show a direction: no margin is then withheld for its direction.
     """
-    if start is not None and config.learns in _KEEP_PREDICTIONS:
+    if start is not None and config.learns == "ratio":
         return start.manifest.pull_direction_deg
     turned_deg = getattr(get_augmentation(config.augmentation), "rotation_deg", 0.0)
     if turned_deg >= 180:
