@@ -41,6 +41,14 @@ def has_colour(image: UInt8[np.ndarray, "height width 3"]) -> bool:
     return bool(np.mean(spread >= _LEAST_COLOUR) >= 0.01)
 
 
+def channel_correlations(image: UInt8[np.ndarray, "height width 3"]) -> tuple[float, float]:
+    """Return the correlations over the pixels of red with green and of green with blue; 1 in a grey image."""
+    red, green, blue = image.reshape(-1, 3).T.astype(np.float64)
+    with np.errstate(invalid="ignore"):  # a channel may be constant
+        pairs = [np.corrcoef(first, second)[0, 1] for first, second in ((red, green), (green, blue))]
+    return float(np.nan_to_num(pairs[0], nan=1.0)), float(np.nan_to_num(pairs[1], nan=1.0))
+
+
 def _require_plain(image: Image.Image, where: str) -> None:
     """Refuse an image that is not one of 8 bits a channel: of 16, Pillow keeps the upper 8, and of 12 these are 4."""
     bits = max(getattr(image, "tag_v2", {}).get(_BITS_PER_SAMPLE, (8,)))

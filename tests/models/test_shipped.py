@@ -108,3 +108,14 @@ def test_the_network_may_be_left_out():
     assert pa.table(alone).equals(
         sliplens.predict("chromatouch-pair", frames + 90, reference=frames[0] + 90).to_arrow()
     )
+
+
+@pytest.mark.parametrize("name", ["chromatouch-pair", "chromatouch-difference"])
+def test_swapped_colours_are_doubted_and_right_ones_are_not(name: str, pulls: list[Recording]):
+    network = sliplens.load(name)
+    for trial in pulls:
+        assert not network.doubts(frame=trial.reference)
+        assert any("swapped" in doubt for doubt in network.doubts(frame=trial.reference[..., ::-1]))
+        assert not network.doubts(frame=np.repeat(trial.reference[..., 1:2], 3, axis=-1))[1:]  # grey: only that doubt
+    swapped = sliplens.predict(network, pulls[0].frames[:2, ..., ::-1], reference=pulls[0].reference[..., ::-1])
+    assert any("swapped" in note for note in swapped.notes)

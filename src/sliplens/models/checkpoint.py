@@ -21,7 +21,7 @@ from sliplens.errors import CheckpointError, ImageError, InputError
 from sliplens.extras import pick, require_device
 from sliplens.files import DIFFERENCE_NETWORK, MANIFEST_FILE, find_run, hash_file, require_folder, whole_file
 from sliplens.friction import LEARNT, Friction, FrictionLike, as_friction
-from sliplens.images import has_colour, require_rgb
+from sliplens.images import channel_correlations, has_colour, require_rgb
 from sliplens.models.backbones import (
     Answers,
     RunBatches,
@@ -60,6 +60,8 @@ class Manifest:
     data_hash: str
     colour: bool | None = None
     """True if the frames it was trained on have colours; None if unknown."""
+    channel_correlations: tuple[float, float] | None = None
+    """Mean correlations of red with green and of green with blue in its training references; None if unknown."""
     head: str = "point"
     recipe: str = ""
     target: str = "safety_margin"
@@ -87,6 +89,8 @@ _BATCH = 64
 _TURN_CURE = (
     "turn the sensor, or train on this direction with `sliplens train DATA -o RUN --augmentation all-directions`"
 )
+_CHANNELS_DIFFER = 0.15
+"""Sum of the differences of two correlations of channels above which those in reverse order are tried."""
 _DARKEST_FRAME, _BRIGHTEST_DIFFERENCE = 8.0, 64.0
 """Medians, in grey levels: no camera frame that shows something is darker, no difference image brighter."""
 
@@ -196,6 +200,14 @@ class Network:
                 "the frames are grey, and the network was trained on colours: its intervals were not measured on such "
                 "frames; use a colour camera, or train it on frames of this one (`sliplens train`)"
             )
+        elif frame is not None and trained.channel_correlations is not None:
+            both = channel_correlations(frame), channel_correlations(frame[..., ::-1])
+            off, off_swapped = (np.abs(np.subtract(pair, trained.channel_correlations)).sum() for pair in both)
+            if off > _CHANNELS_DIFFER and off_swapped < off / 2:
+                doubts.append(
+                    "red and blue seem to be swapped, as in frames of OpenCV: the channels are correlated as those of "
+                    "the training are in reverse order; give RGB, `frames[..., ::-1]`, of frames and reference"
+                )
         if friction is not None and trained.traction is not None:
             low, high = trained.traction.friction[0], trained.traction.friction[-1]
             values, weights = friction.nodes

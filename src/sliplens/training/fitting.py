@@ -20,7 +20,7 @@ from sliplens.codec import save_result
 from sliplens.errors import InputError, ModelError, RecordingError
 from sliplens.extras import pick, require_keywords
 from sliplens.files import output_folder, scratch_folder, versions
-from sliplens.images import has_colour
+from sliplens.images import channel_correlations, has_colour
 from sliplens.models import Manifest, Network, build_model, load, save_checkpoint
 from sliplens.models.backbones import (
     HistogramRegressor,
@@ -162,6 +162,8 @@ def train(
         with open_stage(f"Reading validation trials ({encoding.name})"):
             validation = load_some(trials[1])
         info = trials[0][0]
+        spread = trials[0][:: -(-len(trials[0]) // _DIRECTION_TRIALS)]
+        references = [data.read_labels(each).reference for each in spread]
         manifest = Manifest(
             backbone=config.backbone,
             head=config.head,
@@ -171,7 +173,8 @@ def train(
             frame_size=(info.height, info.width),
             sensor=info.sensor,
             data_hash=data.hash,
-            colour=has_colour(data.read_labels(info).reference),
+            colour=has_colour(references[0]),
+            channel_correlations=tuple(np.mean([channel_correlations(each) for each in references], axis=0).tolist()),
             pull_direction_deg=trained_directions(config, data, trials[0], start),
             trained_on=tuple(trial.sha256[:12] for some in trials for trial in some),
         )
