@@ -1,4 +1,4 @@
-"""The exceptions sliplens raises for mistakes a user can mend; each message is one sentence with the cure."""
+"""The exceptions sliplens raises for mistakes a user can fix; each message is one sentence with the cure."""
 
 from collections.abc import Mapping
 
@@ -6,7 +6,7 @@ _LONGEST = 1500
 
 
 class SliplensError(Exception):
-    """Base of every error that is the user's to mend; the command line prints it and exits with code 2.
+    """Base of every error that the user can fix; the command line prints it and exits with code 2.
 
     It stays a sentence whatever a file holds: of what is longer than that the middle is left out.
     """

@@ -124,7 +124,7 @@ def mean_interval(
 
     Examples
     --------
-    Correlations of frames of two trials, which tell little:
+    Correlations of frames of two trials, which show little:
 
     >>> import numpy as np
     >>> from sliplens.intervals import mean_interval

@@ -70,7 +70,7 @@ def test_camera_frames_with_a_reference_give_the_same(difference: Network, small
 def test_a_raw_network_needs_the_untouched_sensor(raw: Network, difference_folder: Path):
     with pytest.raises(
         InputError,
-        match=r"is as dark as a difference image .*, and this network reads camera frames",
+        match=r"is as dark as a difference image .*, and this network takes camera frames",
     ):
         frames_from_folder(raw, difference_folder)
 

@@ -187,7 +187,7 @@ def test_a_sink_that_breaks_off_says_so_and_the_reading_goes_on(slow: Slow):
         ("rerun:grip.txt", "ends in .rrd"),
         ("zenoh", "names no key that ROS can have; give letters and digits, as zenoh:tip"),
         ("zenoh:a b@tcp/127.0.0.1:1", "names no key"),
-        ("zenoh:tip@tcp/127.0.0.1:1", "reaches nobody at tcp/127.0.0.1:1"),
+        ("zenoh:tip@tcp/127.0.0.1:1", "reaches nothing at tcp/127.0.0.1:1"),
         ("paper", "there is no sink named 'paper'"),
     ],
 )

@@ -124,7 +124,7 @@ class LivePage:
     async def _serve(self, started: Event) -> None:
         self._loop, self._over = asyncio.get_running_loop(), asyncio.Event()
         crowd: dict[BoundedConnection, None] = {}
-        silent = logging.Logger("sliplens.app", logging.CRITICAL)  # of failed requests nobody wants to read
+        silent = logging.Logger("sliplens.app", logging.CRITICAL)  # failed requests are of no interest
         async with serve(
             self._talk,
             sock=self._socket,

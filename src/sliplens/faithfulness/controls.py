@@ -61,7 +61,7 @@ def infidelity(
 ) -> Float[np.ndarray, " images"]:
     """Root of Captum's infidelity: error of the change that a map predicts where half of the pixels are replaced.
 
-    The pixels, drawn anew for each sample, become those of the reference; their relevance should sum to the change.
+    The pixels, drawn again for each sample, become those of the reference; their relevance should sum to the change.
 
     Yeh et al., *On the (in)fidelity and sensitivity of explanations*, NeurIPS 2019, definition 2.1.
     """
@@ -168,7 +168,7 @@ def centre(images: Images) -> ControlMaps:
 def control_maps(model: nn.Module, images: Images, references: Images) -> dict[str, Maps]:
     """Compute maps that use nothing the network learned, by name, of images and their baselines.
 
-    Beside these stand random orders, and each explainer on networks whose weights were drawn anew. A network without
+    Beside these stand random orders, and each explainer on networks whose weights were drawn again. A network without
     layers that have a map has no `weights-1`.
 
     Clark et al., *XAI-TRIS* (2024), edge filters; Adebayo et al., *Sanity Checks for Saliency Maps* (2018).
@@ -212,7 +212,7 @@ def lead_over_controls(
 
 
 def cascade(model: nn.Module, *, seed: int, stages: int, images: Images) -> Iterator[tuple[int, nn.Module]]:
-    """Draw the weights of a copy of a network anew, layer by layer from the output to the input.
+    """Draw the weights of a copy of a network again, layer by layer from the output to the input.
 
     Yield, at so many stages, evenly spread, how many layers have new weights, and the network; the next stage changes
     it. Normalisation gets the statistics of the images, two at least, or every image would get one answer.

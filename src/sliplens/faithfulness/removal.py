@@ -29,7 +29,7 @@ Redraw: TypeAlias = Callable[
 AREAS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 """Shares of the image that are removed; dense where maps differ most."""
 SHARES = (0.0, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
-"""Shares of the markers that are put back: each is drawn anew, and of 42 markers one is 2 %."""
+"""Shares of the markers that are put back: each is drawn again, and of 42 markers one is 2 %."""
 RANDOM_ORDERS = 20
 
 

@@ -277,4 +277,4 @@ def _require_fit(controller: Controller, readers: Sequence[LiveReader]) -> None:
             if not reader.source.simulated:
                 raise InputError(f"this controller needs the true margin, which {name} does not have; choose margin")
         elif isinstance(controller, MarginLaw) and reader.network is None:
-            raise InputError(f"this controller needs margins, and no network reads {name}; name one with --network")
+            raise InputError(f"this controller needs margins, and {name} has no network; name one with --network")

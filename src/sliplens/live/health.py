@@ -185,7 +185,7 @@ class HealthMonitor:
             return None
         status = self._markers.status
         if (status == MarkerStatus.LOST).any():
-            return 1.0, "the pattern of the markers has jumped, and none can be told from the next"
+            return 1.0, "the pattern of the markers has jumped, and none can be distinguished from the next"
         absent = np.isin(status, (MarkerStatus.MISSING, MarkerStatus.BROKEN))
         return float(absent.sum() / max(1, (absent | (status == MarkerStatus.FOLLOWED)).sum()))
 
@@ -243,7 +243,7 @@ CHECKS = {
     ),
     "saturation": CheckKind(
         measure=lambda health, frame: max(0.0, _saturated_share(frame.small) - health._saturated), limit=0.06,
-        unit="share", cure="mend the exposure or the lamps", harm=(0.16, 0.36),
+        unit="share", cure="correct the exposure or the lamps", harm=(0.16, 0.36),
         sentence="{:.0%} of the picture have turned black or white",
     ),
     "exposure": CheckKind(

@@ -59,7 +59,7 @@ class Outlet(Mailbox[Item]):
 
     verb = "sent"
     """Action with an item, in messages."""
-    cure = "begin it anew"
+    cure = "start it again"
 
     def __init__(self, name: str, *, most_bytes: int) -> None:
         super().__init__(most_bytes=most_bytes)

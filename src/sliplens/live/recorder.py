@@ -35,7 +35,7 @@ _FACTS = TrialFacts(trial="live")
 class Recorder(Outlet[tuple[LiveFrame, Frame | None]]):
     """Records frames into a data set, a new one or one that is there, as trials `NAME-1`, `NAME-2` and so on.
 
-    A trial ends, and the next begins, where the reference is taken anew, the size changes or the clock jumps back. A
+    A trial ends, and the next begins, where the reference is taken again, the size changes or the clock jumps back. A
     process that is killed loses the frame that it was writing; `recover_dataset` makes trials of the rest.
 
     Parameters

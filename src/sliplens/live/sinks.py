@@ -221,7 +221,7 @@ class ZenohRos:
     Raises
     ------
     InputError
-        If a package is missing, or nobody is there.
+        If a package is missing, or nothing answers.
 
     References
     ----------
@@ -235,7 +235,7 @@ class ZenohRos:
         from zenoh import ext  # noqa: PLC0415
 
         self._types, self._ext, self._error = get_typestore(Stores.LATEST), ext, zenoh.ZError
-        # it connects to the given address and calls out to nobody else
+        # it connects to the given address and contacts no other host
         settings = {
             "mode": "client",
             "connect": {"endpoints": [address], "timeout_ms": _ZENOH_PATIENCE_MS},
@@ -245,7 +245,7 @@ class ZenohRos:
             self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
         except zenoh.ZError as error:
             raise InputError(
-                f"{purpose} reaches nobody at {address} ({error}); start zenoh-bridge-ros2dds or rmw_zenohd there, "
+                f"{purpose} reaches nothing at {address} ({error}); start zenoh-bridge-ros2dds or rmw_zenohd there, "
                 "or name another with zenoh:KEY@tcp/HOST:PORT"
             ) from None
 

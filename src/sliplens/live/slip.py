@@ -94,7 +94,7 @@ class SlipBatch:
     def __init__(self, rest_px: Float[np.ndarray, "contacts markers 2"]) -> None:
         contacts, markers, _ = rest_px.shape
         if markers < _FEWEST:
-            raise InputError(f"{markers} markers are too few to tell slip, at least {_FEWEST} are needed")
+            raise InputError(f"{markers} markers are too few to detect slip, at least {_FEWEST} are needed")
         # fields have the coordinate before the marker: sums over markers are several times faster
         self._rest = np.ascontiguousarray(rest_px.swapaxes(1, 2), dtype=np.float64)
         self._reach_px = np.linalg.norm(_from_middle(self._rest), axis=1).mean(axis=1)
@@ -354,7 +354,7 @@ class SlipDetector:
     References
     ----------
     Dong, Ma, Donlon and Rodriguez, *Maintaining Grasps within Slipping Bounds by Monitoring Incipient Slip*, ICRA 2019.
-    Page, *Continuous Inspection Schemes*, Biometrika 41 (1954), for a change told where it is most likely.
+    Page, *Continuous Inspection Schemes*, Biometrika 41 (1954), for a change placed where it is most likely.
 
     Examples
     --------

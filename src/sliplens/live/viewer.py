@@ -167,7 +167,7 @@ def _rows_of(capture: Capture, path: Path, columns: Sequence[str], *, command: s
     values = np.stack([rows[name].cast(pa.float64()).to_numpy() for name in ("frame", *columns)], axis=1)
     last = int(values[:, 0].max())
     if values[:, 0].min() < 0 or last >= len(capture):
-        raise InputError(f"{path} has frame {last} of {capture.trial}, which has {len(capture)}; predict it anew")
+        raise InputError(f"{path} has frame {last} of {capture.trial}, which has {len(capture)}; predict it again")
     return values
 
 

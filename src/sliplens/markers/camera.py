@@ -28,7 +28,7 @@ _PASSES, _SCALE_PX = 5, 0.3  # of the robust fit: its passes, and the misfit at 
 _LIGHT_PX = 0.5  # motion below which a contact is left out of the fit: what it moves is then below every limit
 _MARKER_SHARES, _BORDER_SHARES = (0.3, 0.2, 0.1), (np.inf, np.inf, 0.5)
 """Shift, zoom and turn that a healthy contact passes for at most: shares of its own motion where markers show that, and
-multiples of the misfit where parts of the border do, by which a wide contact cannot be told from a shift or a zoom.
+multiples of the misfit where parts of the border do, by which a wide contact is like a shift or a zoom.
 Chosen on the markers of 1,380 frames in contact of 170 simulated sensors (series `health-choose-camera`), which exceed
 them by 0.43 px at most, and on 120 drawn ones of `health-choose`."""
 

@@ -168,7 +168,7 @@ class Network:
         median = f"(median {level:.0f} of 255 grey levels)"
         if not self.encoding.empty_is_black and level < _DARKEST_FRAME and frame.any():
             raise ImageError(
-                f"{what} is as dark as a difference image {median}, and this network reads camera frames; give those, "
+                f"{what} is as dark as a difference image {median}, and this network takes camera frames; give those, "
                 f"or a network on difference images such as {DIFFERENCE_NETWORK}"
             )
         if self.encoding.empty_is_black and level > _BRIGHTEST_DIFFERENCE:
@@ -192,7 +192,7 @@ class Network:
         trained, doubts = self.manifest, []
         if sensor and trained.sensor and sensor_kind(sensor) != sensor_kind(trained.sensor):
             doubts.append(
-                f"the network was trained on {trained.sensor} and reads frames of {sensor}: take margins for a trend "
+                f"the network was trained on {trained.sensor} and the frames are of {sensor}: take margins for a trend "
                 "until `sliplens evaluate` on trials with forces measures its intervals there"
             )
         if frame is not None and trained.colour and not has_colour(frame):
@@ -294,7 +294,7 @@ class Network:
         """Return the calibration of F_t / F_n, without which a friction cannot be used."""
         if self.manifest.traction is None:
             raise InputError(
-                "this network answers with the margin alone and cannot use or learn a friction; leave it out, or teach "
+                "this network predicts the margin alone and cannot use or learn a friction; leave it out, or teach "
                 "the network F_t / F_n with `sliplens train DATA -o RUN --start-from NETWORK --recipe ratio`"
             )
         return self.manifest.traction

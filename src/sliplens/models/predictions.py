@@ -238,7 +238,7 @@ def predict(
                 name, origin = profile.network, f"which the profile {profile.name} names"
             elif any(kind.read_reference is None and not _is_recorded(kind) for kind in trials.kinds):
                 name, origin = DIFFERENCE_NETWORK, "which comes with sliplens for difference images"
-            add_note(f"no network was named, so {name} reads it, {origin}")
+            add_note(f"no network was named, so {name} predicts it, {origin}")
             network = open_run(name, device=device)
         kinds = [_assume_reference(network, capture) for capture in trials.kinds]
         notes = _list_notes(network, kinds, profile, friction=prior)

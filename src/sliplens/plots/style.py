@@ -139,7 +139,7 @@ def name_methods(text: str) -> str:
 def fill_name(fill: str, unit: str = "pixel") -> str:
     """Return the display name of a fill, and of the removed parts where they are not pixels."""
     name = FILL_NAMES.get(fill, fill)
-    # the true scene is drawn anew without one marker's motion: there is no other unit
+    # the true scene is drawn again without one marker's motion: there is no other unit
     return name if unit == "pixel" or fill == "true" else f"{name} ({UNIT_NAMES.get(unit, unit)})"
 
 

@@ -173,7 +173,7 @@ def load_profile(profile: Path | str | SensorProfile) -> SensorProfile:
         # Windows editors put a mark before the text that TOML does not know
         values = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not valid TOML: {error}; mend it there") from None
+        raise InputError(f"{path} is not valid TOML: {error}; correct it there") from None
     names = [field.name for field in fields(SensorProfile)]
     if strange := sorted(set(values) - set(names)):
         raise InputError(f"{path} has {strange[0]!r}, which no sensor profile has; choose from {', '.join(names)}")
@@ -182,7 +182,7 @@ def load_profile(profile: Path | str | SensorProfile) -> SensorProfile:
     except (msgspec.ValidationError, ValueError) as error:
         text, _, place = str(error).partition(" - at ")
         where = f" at {place.strip('`').removeprefix('$.')}" if place.strip("`") not in {"", "$"} else ""
-        raise InputError(f"{path} is no sensor profile: {text}{where}; mend it there") from None
+        raise InputError(f"{path} is no sensor profile: {text}{where}; correct it there") from None
 
 
 def is_profile(sensor: Path | str | SensorProfile) -> bool:

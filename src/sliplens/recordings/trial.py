@@ -225,10 +225,10 @@ def require_rising(time_s: Float[np.ndarray, " samples"], *, what: str) -> None:
     with np.errstate(invalid="ignore"):  # of infinite times, which the first law refuses
         steps = np.diff(time_s, prepend=time_s[:1] - 1)
     laws = (
-        (np.isfinite(time_s), "the time of sample {at} is {time:g}, no number; mend its stamp"),
-        (steps > 0, "time does not rise at sample {at} ({time:.6f} s); sort or mend the stamps"),
+        (np.isfinite(time_s), "the time of sample {at} is {time:g}, no number; correct its stamp"),
+        (steps > 0, "time does not rise at sample {at} ({time:.6f} s); sort or correct the stamps"),
         ((time_s >= CLOCK_S[0]) & (time_s <= CLOCK_S[1]), "times reach {time:.4g} s, as none do; give seconds"),
-        (steps <= _STEPS_S[1], "sample {at} comes more than a day late; mend or drop its stamp"),
+        (steps <= _STEPS_S[1], "sample {at} comes more than a day late; correct or drop its stamp"),
     )
     for holds, message in laws:
         if not holds.all():

@@ -50,7 +50,7 @@ def write_report(
     out
         HTML file to write; it appears when complete. `report.html` in the workspace if not given.
     waiting_for
-        What is still being made, in words; the page says so, and loads itself anew every few seconds.
+        What is still being made, in words; the page says so, and reloads every few seconds.
 
     Returns
     -------

@@ -107,19 +107,19 @@ def plate_strip(strip: Strip) -> Plate:
 
 
 def plate_moved(strip: Strip, moved: MovedMarkers) -> Plate:
-    """Draw a frame, and the same drawn anew with the markers that a map ranks first moved back to stick."""
+    """Draw a frame, and the same drawn again with the markers that a map ranks first moved back to stick."""
     few, all_, random = (style.signed(-100 * gap, 0) for gap in (moved.change, moved.change_all, moved.change_random))
     count = len(moved.from_px)
     figure = draw_pictures(
         [PictureRow(name="camera", pictures=[strip.pictures[-1], strip.redrawn[0]])],
-        heads=[f"predicted {percent(moved.prediction)}", f"drawn anew:\n{percent(moved.prediction - moved.change)}"],
+        heads=[f"predicted {percent(moved.prediction)}", f"drawn again:\n{percent(moved.prediction - moved.change)}"],
     )
     ring = {"markersize": 5, "fillstyle": "none", "color": "white", "markeredgewidth": 0.8}
     for ax in figure.axes:
         ax.plot(*zip(*moved.from_px, strict=True), "o", **ring)
     return Plate(
         figure=figure,
-        alt=f"A frame with {count} of {moved.markers} markers circled, and the frame drawn anew with these moved back",
+        alt=f"A frame with {count} of {moved.markers} markers circled, and the frame drawn again with these moved back",
         caption=f"Moving just these {count} of {moved.markers} markers back to where they stuck changes the prediction "
         f"by {few} points; moving all of them, by {all_}; {count} random ones, by {random} (mean of "
         f"{moved.random_sets} draws). The simulator drew the second picture anew, and the network predicted it. The "

@@ -199,7 +199,7 @@ def table_properties(results: Results) -> CellTable:
         ]
     measures = "Resolution", "Total variation", "Infidelity", "Max-sensitivity"
     return make_table(
-        "Resolution: depth of the valley between neighbouring markers (1 = told apart). Variation: mean step "
+        "Resolution: depth of the valley between neighbouring markers (1 = distinguished). Variation: mean step "
         "between pixels over the map's range (noise has 1/3). Infidelity: error of the change that a map predicts if "
         "half of the pixels become the baseline's, in units of the output; max-sensitivity: largest change of a map "
         "under noise of 2 %, as a share of the map (two frames each). Seconds a frame beside other work; the thesis "

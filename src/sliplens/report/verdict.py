@@ -119,7 +119,7 @@ class MethodRow:
     input: str
     method: str
     score: str
-    """Agreement with the neutral truth, or the symmetric gain where the scene cannot be drawn anew."""
+    """Agreement with the neutral truth, or the symmetric gain where the scene cannot be drawn again."""
     control: str
     lead: str
     """Score less that of the strongest control, with its 95 % interval."""
@@ -207,7 +207,7 @@ def why_no_verdict(results: Results, name: str) -> str | None:
 
 
 def judge_study(results: Results) -> tuple[MethodRow, ...]:
-    """Judge the methods of all networks: by the neutral truth where the scene can be drawn anew, else by removal."""
+    """Judge the methods of all networks: by the neutral truth where the scene can be drawn again, else by removal."""
     rows: list[MethodRow] = []
     for name in style.inputs_in_order({*results.truth, *results.faithfulness})[::-1]:
         truth, faithful = results.truth.get(name), results.faithfulness.get(name)
@@ -270,7 +270,7 @@ def answer_trust(rows: Sequence[MethodRow], reasons: Iterable[str | None] = ()) 
         judged = {row.method: row.status for row in rows if row.input == name}
         ahead = [style.method_name(method) for method, status in judged.items() if status == "ahead"]
         rest = [style.method_name(method) for method, status in judged.items() if status in {"tied", "behind"}]
-        nothing = "a map that knows nothing of the network"
+        nothing = "a map that uses nothing of the network"
         text = (
             f"yes, {style.listed(ahead)}" if ahead else f"no; no method is ahead of {nothing}" if rest else "not known"
         )

@@ -22,10 +22,10 @@ UNIT = Meta(description="margin units")
 
 MARGIN, FORCE, RATIO = map(_label, ("safety_margin", "normal_force_n", "friction_coefficient"))
 TIME = Meta(ge=CLOCK_S[0], le=CLOCK_S[1])
-"""Bounds of what a recording tells, in its units; those of this table are asked of every result that is loaded."""
+"""Bounds of measured values, in their units; those of this table are asked of every result that is loaded."""
 FRICTION = Meta(gt=0, le=MOST_FRICTION)
 ANSWER = Meta(ge=-1000, le=1000, description="margin units")
-"""Of answers that are not clipped, and of their parts and changes: a thousand times what there is to tell."""
+"""Bounds of predictions that are not clipped, and of their parts and changes: a thousand times a margin's range."""
 AMOUNT = Meta(ge=0)
 """Of counts, sizes and squares."""
 _ROUNDED = 1 + 1e-6
@@ -144,7 +144,7 @@ class LeadTimes:
 
 @dataclass(frozen=True, kw_only=True)
 class ScoredFrames(Columns):
-    """Label and answer of each labelled frame, in margin units; what the network does not tell is NaN."""
+    """Label and prediction of each labelled frame, in margin units; what the network does not predict is NaN."""
 
     trial: Shaped[np.ndarray, " frames"]
     condition: Shaped[np.ndarray, " frames"]
@@ -155,7 +155,7 @@ class ScoredFrames(Columns):
     prediction: Annotated[Float64[np.ndarray, " frames"], ANSWER]
     """Not clipped to [0, 1]."""
     sigma: Annotated[Float64[np.ndarray, " frames"], AMOUNT, UNKNOWN]
-    """Standard deviation of the answer; NaN for a network that answers with one number."""
+    """Standard deviation of the prediction; NaN for a network with one number as its output."""
     low_90: Annotated[Float64[np.ndarray, " frames"], MARGIN, UNKNOWN]
     high_90: Annotated[Float64[np.ndarray, " frames"], MARGIN, UNKNOWN]
     """Ends of the interval that should hold 90 % of the labels; NaN for a network that was not calibrated."""
@@ -172,7 +172,7 @@ class RiskCoverage:
     """Shares of the frames that are answered, from 1 down."""
     error: dict[str, tuple[Annotated[float, AMOUNT], ...]]
     """Mean absolute error at each share, in margin units, by what is withheld first: `known`, what is least like the
-    training (`Estimate.known`); `spread`, the widest answers; `perfect`, the largest errors, which nobody knows."""
+    training (`Estimate.known`); `spread`, the widest distributions; `perfect`, the largest errors (unknown in use)."""
 
     def error_at(self, reason: str, share: float) -> float:
         """Mean absolute error while a share of the frames is answered, in margin units."""
@@ -209,7 +209,7 @@ class Evaluation(Result):
     friction: str = ""
     """Coefficient of friction that the margins are conditioned on; empty if none."""
     ratio_r2: dict[str, float | None] = field(default_factory=dict)
-    """R2 of the traction ratio F_t / F_n by condition; empty for a network that answers with the margin alone, None
+    """R2 of the traction ratio F_t / F_n by condition; empty for a network that predicts the margin alone, None
     where the ratio does not vary or no force is known."""
     risk: RiskCoverage | None = None
     """Error as more and more frames are withheld; None in a result without it."""

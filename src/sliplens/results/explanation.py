@@ -241,9 +241,9 @@ class StripReadings(Columns):
 
 @dataclass(frozen=True, kw_only=True)
 class MovedMarkers:
-    """Proof of a map: the frame drawn anew with the markers that it ranks first moved back to the stick frame.
+    """Proof of a map: the frame drawn again with the markers that it ranks first moved back to the stick frame.
 
-    Changes are predictions of the frame less those of the frame drawn anew, in margin units.
+    Changes are predictions of the frame less those of the frame drawn again, in margin units.
     """
 
     frame: Annotated[int, AMOUNT]
@@ -279,8 +279,8 @@ class Strip(Result):
     """Signed contribution of each pixel to f(x) - f(baseline), in margin units."""
     baseline: BaselineName = "untouched"
     moved: MovedMarkers | None = None
-    """Of the last frame that is shown; None where no stick frame was found or the trial cannot be drawn anew."""
+    """Of the last frame that is shown; None where no stick frame was found or the trial cannot be drawn again."""
     redrawn: UInt8[np.ndarray, "redrawn rows_px columns_px 3"] = field(
         default_factory=lambda: np.zeros((0, 1, 1, 3), dtype=np.uint8)
     )
-    """That frame drawn anew, or none."""
+    """That frame drawn again, or none."""

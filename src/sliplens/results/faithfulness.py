@@ -18,7 +18,7 @@ Key = tuple[str, str, str]
 """Fill, unit and method."""
 CHANCE = "random"
 NEW_WEIGHTS = "-new-weights"
-"""Ends the name of a method's maps of networks whose weights were drawn anew."""
+"""Ends the name of a method's maps of networks whose weights were drawn again."""
 CONTROLS = ("change", "local-change", "weights-1", "centre", "edges", CHANCE)
 
 

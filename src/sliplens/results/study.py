@@ -126,7 +126,7 @@ class States(Result):
 
 @dataclass(frozen=True, kw_only=True)
 class UntrainedMaps(OfNetwork):
-    """Maps of networks whose weights were drawn anew: controls that every map has to beat."""
+    """Maps of networks whose weights were drawn again: controls that every map has to beat."""
 
     maps: dict[str, Annotated[Float32[np.ndarray, "frames size size"], ANSWER]]
     """Maps that the methods rank by, towards the targets of those networks, by method with `NEW_WEIGHTS`. Poly-CAM has
@@ -173,13 +173,13 @@ class Localisation:
 
 @dataclass(frozen=True, kw_only=True)
 class MetaTest:
-    """How much the gain under one fill tells a perfect map from a damaged one, over frames."""
+    """How much larger the gain under one fill is for a perfect map than for a damaged one, over frames."""
 
     fill: str
     oracle: float
     degraded: float
     changed: float
-    """Gain of |x - b|, how much each marker's pixels changed, which knows no network."""
+    """Gain of |x - b|, how much each marker's pixels changed, which uses no network."""
     gap: Difference | None
     """Gain of the perfect map less that of the damaged one."""
 
@@ -297,7 +297,7 @@ SETTINGS = (
     Setting(fill="reference", unit="marker"),
 )
 REDRAWN = Setting(fill="true", unit="marker")
-"""Markers are put back in the scene, which is drawn anew."""
+"""Markers are put back in the scene, which is drawn again."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -345,7 +345,7 @@ class Study(Result):
     folder: Path = Path()
     """Workspace that holds the stages; a temporary one is there as long as the study."""
     config: StudyConfig | None = None
-    """None where its folder has none: all that its data can tell is expected."""
+    """None where its folder has none: all that its data can show is expected."""
     evaluations: dict[str, Evaluation] = field(default_factory=dict)
     choice: Choice | None = None
     states: States | None = None

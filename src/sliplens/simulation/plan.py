@@ -287,7 +287,7 @@ def _with_totals(plans: Sequence[TrialPlan], totals: dict[str, int]) -> tuple[Tr
 
 
 def _spread(trials: int, *, days: int, tested: range) -> dict[int, int]:
-    """Deal dry trials to the days in turn, to the first and a test day first so that no split is empty."""
+    """Assign dry trials to the days in turn, to the first and a test day first so that no split is empty."""
     between = [day for day in range(2, days + 1) if day not in tested]
     order = [1, tested[-1], *between, *tested[:-1]]
     counts = {day: len(range(index, trials, len(order))) for index, day in enumerate(order)}

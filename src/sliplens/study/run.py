@@ -193,7 +193,7 @@ class Records:
 
     @cached_property
     def not_redrawn(self) -> str:
-        """Reason why the chosen frames cannot be drawn anew with markers put back; empty where they can."""
+        """Reason why the chosen frames cannot be drawn again with markers put back; empty where they can."""
         if not self.data.simulated:
             return "the data were recorded"
         try:

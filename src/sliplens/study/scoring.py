@@ -235,7 +235,7 @@ class Removal(Stage[Faithfulness]):
     areas: Sequence[float] = STUDY_AREAS
     random_orders: int = RANDOM_ORDERS
     redraw: Callable[[Explanation, Influence, int], Mapping[str, RemovalCurve]] | None = None
-    """Curves under the true fill, by drawing the scene anew; None where it cannot be."""
+    """Curves under the true fill, by drawing the scene again; None where it cannot be."""
     seed: int = 0
 
     @property
@@ -408,7 +408,7 @@ def _shortened(explainer: Explainer) -> Explainer:
 
 @dataclass(frozen=True, kw_only=True)
 class Untrained(Stage[UntrainedMaps]):
-    """Maps of networks with all weights drawn anew by each method: controls that every map has to beat.
+    """Maps of networks with all weights drawn again by each method: controls that every map has to beat.
 
     Each trial, a part, has a network of its own, so that resampled trials tell what the draw of the weights matters
     too. Poly-CAM measures 5 % of the channels here and has no likeness, Shapley values draw 100 pairs of coalitions.

@@ -102,7 +102,7 @@ class StagedFrame:
 
 
 def stage_frames(trained: Network, explained: Explanation, data: Dataset) -> tuple[StagedFrame, ...]:
-    """Make frames of a study ready to be drawn anew."""
+    """Make frames of a study ready to be drawn again."""
     require_same_network(trained, explained)
     staged: dict[int, StagedFrame] = {}
     for trial, rows in explained.trials.items():
@@ -254,7 +254,7 @@ class JudgingByTruth(Stage[Truth]):
     The main judge is neutral: no map is made to predict how groups of markers, moved to another margin of the trial,
     change the prediction. Beside it, marker by marker, the mean of a map is compared with Shapley values of the stick
     game and of the untouched game. All are signed, along the change of the prediction, which leaves correlations of
-    methods as they are. A control knows no sign: it has the one that
+    methods as they are. A control has no sign: it has the one that
     suits it where leads are taken.
     """
 
@@ -407,10 +407,10 @@ def _judge(
     *,
     seed: int,
 ) -> dict[str, Localisation]:
-    # frames in which nothing changes judge nobody; the others judge all maps
+    # frames in which nothing changes score no map; the others score all
     valid = np.isfinite(neutral[CHANCE])
     ranks, of_valid = {name: rows[valid] for name, rows in neutral.items()}, clusters[:, valid]
-    # a control knows no sign: it has the one that suits it
+    # a control has no sign: it gets the better one
     controls = {
         name: np.copysign(1.0, rows.mean()) * rows
         for name, rows in ranks.items()

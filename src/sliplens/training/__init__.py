@@ -1,4 +1,4 @@
-"""Train a network and measure how well it reads the safety margin."""
+"""Train a network and measure how well it predicts the safety margin."""
 
 from sliplens.training.config import RECIPES, TrainingConfig
 from sliplens.training.evaluation import evaluate, evaluate_frames, lead_times, regression_scores

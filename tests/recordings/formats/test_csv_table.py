@@ -154,7 +154,7 @@ def test_what_is_declared_is_not_guessed(tmp_path: Path):
         ("time,fx,fy,fz\nnan,1,2,3\n", r"line 2, 'time' is 'nan', not a finite number"),
         ("time,fx,fy,fz\n0,1,nan,3\n1,,2,3\n", "has no sample that is a number"),
         ("time,fx,fy,fz\n0,1,2,3\n0,1,2,3\n", r"line 3: 'time' repeats \(0, then 0\)"),
-        ("time,fx,fy,fz\n0,1,2,3\n1,1,2\n", "line 3 has 3 columns but the header 4; mend the line"),
+        ("time,fx,fy,fz\n0,1,2,3\n1,1,2\n", "line 3 has 3 columns but the header 4; correct the line"),
         ("time,fx,fy,fz\n0,1,1,5,2,5,3,5\n", "where decimals are commas, separate the columns by semicolons"),
         ("time;fx;fy;fz\n0;1,5;2;3\n1;1.5;2;3\n", "mixes decimal commas and points"),
         ("time,fx,fy,fz\n0,1,2,3\n1,1,2,20000\n", r"line 3: 2e\+04 N is no force of a fingertip"),

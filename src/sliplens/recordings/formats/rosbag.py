@@ -49,7 +49,7 @@ def _message_size(message: Any, *, where: str) -> tuple[int, int]:
     fits = step >= width * channels and height * step <= len(message.data) and not (channels == 2 and width % 2)
     if not (height and width and fits):
         claims = f"claims {height} rows of {step} bytes for {width} pixels of {message.encoding}"
-        raise RecordingError(f"{where} {claims} but holds {len(message.data)} bytes; mend it or record it again")
+        raise RecordingError(f"{where} {claims} but holds {len(message.data)} bytes; correct it or record it again")
     return height, width
 
 

@@ -151,7 +151,7 @@ def _split(path: Path, line: int, text: str, separator: str) -> list[str]:
     try:
         (cells,) = csv.reader([text], delimiter=separator, skipinitialspace=separator != "\t")
     except (csv.Error, ValueError) as error:
-        raise RecordingError(f"{path}, line {line} cannot be split into columns ({error}); mend it") from None
+        raise RecordingError(f"{path}, line {line} cannot be split into columns ({error}); correct it") from None
     return [cell.strip() for cell in cells]
 
 
@@ -166,7 +166,7 @@ def _split_lines(
         begun = begun or len(cells) == width
         if begun and len(cells) != width:
             comma = separator == "," and len(cells) > width
-            cure = "where decimals are commas, separate the columns by semicolons" if comma else "mend the line"
+            cure = "where decimals are commas, separate the columns by semicolons" if comma else "correct the line"
             raise RecordingError(f"{path}, line {line} has {len(cells)} columns but the header {width}; {cure}")
         if begun:
             yield line, cells
@@ -201,7 +201,7 @@ def to_number(text: str, *, table: TextTable, line: int, column: str) -> float:
         value = nan
     if not isfinite(value):
         where = f"{table.place(line)}, {column!r}"
-        raise RecordingError(f"{where} is {text[:40]!r}, not a finite number; mend or drop the {table.row}")
+        raise RecordingError(f"{where} is {text[:40]!r}, not a finite number; correct or drop the {table.row}")
     return value
 
 
