@@ -4,7 +4,7 @@ import io
 import re
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -19,8 +19,8 @@ from sliplens.files import require_file, require_folder
 
 __all__ = ["absolute_difference", "as_frames", "list_images", "read_image", "signed_difference", "write_png"]
 
-Buffer: TypeAlias = Any  #: Bytes of a file in memory.
-Images: TypeAlias = Any  #: Images in memory that `as_frames` takes: an array, a PyTorch tensor, or a list of them.
+Buffer: TypeAlias = Any  #: Bytes of a file in memory, or an image of Pillow.
+Images: TypeAlias = Any  #: Images that `as_frames` takes: an array, a PyTorch tensor, an image, or a list of them.
 
 IMAGE_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp"})
 
@@ -72,9 +72,12 @@ def _open_image(source: Path | Buffer, where: str, cure: str = "") -> Iterator[I
         with warnings.catch_warnings():
             # Pillow warns near the limit that is checked below
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            stream = source if isinstance(source, Path) else io.BytesIO(source)
-            image = Image.open(stream, formats=("PNG", "TIFF", "JPEG", "BMP"))
-        with image:
+            if isinstance(source, Image.Image):
+                opened = nullcontext(source)  # the caller closes it
+            else:
+                stream = source if isinstance(source, Path) else io.BytesIO(source)
+                opened = Image.open(stream, formats=("PNG", "TIFF", "JPEG", "BMP"))
+        with opened as image:
             if image.width * image.height > MOST_PIXELS:
                 raise ValueError(f"{image.width} x {image.height} pixels are more than any camera has")
             _require_plain(image, where)
@@ -115,7 +118,7 @@ def read_image(
     Parameters
     ----------
     source
-        File, or its bytes in memory.
+        File, its bytes in memory, or an image of Pillow.
     size
         Height and width that it must have, in pixels.
     where, cure
@@ -305,7 +308,7 @@ def require_rgb(images: Images, *, what: str = "frames") -> None:
     Levels of other types are ambiguous: 1.0 may be white or almost black.
     """
     if not isinstance(images, np.ndarray):
-        raise ImageError(f"the {what} are of type {type(images).__name__}; give a NumPy array of uint8")
+        raise ImageError(f"the {what} are of type {type(images).__name__}; give an array of uint8, or images")
     if images.dtype != np.uint8:
         cure = _CURES.get(images.dtype.kind, "give the levels of the camera, from 0 to 255")
         raise ImageError(f"the {what} hold {images.dtype}, and sliplens takes 8-bit RGB (uint8); {cure}")
@@ -315,13 +318,13 @@ def require_rgb(images: Images, *, what: str = "frames") -> None:
 
 
 def as_frames(images: Images, *, what: str = "frames") -> UInt8[np.ndarray, "frames height width 3"]:
-    """Return images in memory as 8-bit RGB frames; their layout is converted, their levels are not.
+    """Return images as 8-bit RGB frames; their layout is converted, their levels are not.
 
     Parameters
     ----------
     images
         Array or PyTorch tensor: frames (frames, height, width, 3), or one of them; of a tensor also with the colours
-        first (frames, 3, height, width); or a list of such images.
+        first (frames, 3, height, width); the path of an image, or one of Pillow; or a list of such images.
 
     Raises
     ------
@@ -343,6 +346,10 @@ def as_frames(images: Images, *, what: str = "frames") -> UInt8[np.ndarray, "fra
             sides = " and ".join(f"{height} x {width}" for height, width, _ in sorted(sizes)[:2])
             raise ImageError(f"the {what} have different sizes, such as {sides} pixels; give those of one camera")
         return np.concatenate(parts)
+    if isinstance(images, Path | str):
+        return read_image(Path(images))[None]
+    if isinstance(images, Image.Image):
+        return read_image(images, where=f"an image of the {what}")[None]
     if tensor := hasattr(images, "detach"):  # PyTorch, which this module does without
         images = images.detach().cpu().numpy()
     if tensor and images.ndim in {3, 4} and images.shape[-1] != 3 == images.shape[-3]:

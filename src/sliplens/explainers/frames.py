@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby, islice
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, Unpack
 
 import numpy as np
 import torch
@@ -18,10 +18,10 @@ from sliplens.explainers.occlusion import markers_in_frame, markers_in_recording
 from sliplens.markers import track_markers
 from sliplens.markers.estimators import affine_parts, find_hold
 from sliplens.models import Network
-from sliplens.recordings import Dataset
+from sliplens.models.predictions import assume_reference
+from sliplens.recordings import Dataset, Recording
 from sliplens.recordings.capture import Capture
-from sliplens.recordings.sensor import SensorProfile
-from sliplens.recordings.source import open_source
+from sliplens.recordings.source import SourceOptions, open_source
 from sliplens.results.explanation import MARGIN_LEVELS, BaselineName
 
 _STICK_SHARE = 0.97  # of the trial's largest margin
@@ -241,32 +241,37 @@ def nearest_frame(margin: Float[np.ndarray, " frames"], level: float) -> int:
 
 def frames_from_folder(
     network: Network,
-    folder: Path,
+    source: Path | str | Recording,
     *,
-    reference: Path | str | UInt8[np.ndarray, "height width 3"] | None = None,
     labels_in_names: bool = False,
-    sensor: SensorProfile | Path | str | None = None,
     baseline: Baseline | None = "untouched",
+    **facts: Unpack[SourceOptions],
 ) -> ChosenFrames:
-    """Choose all images of a folder, in natural order, or all frames of another recording that `open_source` opens.
+    """Choose all images of a folder, in natural order, or all frames of a recording that `open_source` opens.
 
-    They are camera frames if `reference` is set or the source has one, else absolute difference images |T_n - T_0|. If
-    `labels_in_names`, names that end in `_GG`, such as `image_433_20.png`, hold the safety margin in percent. If
+    They are camera frames if the `facts`, those of `open_source`, or the source name a reference, or the network
+    compares frames of a recording, else absolute difference images |T_n - T_0|. If `labels_in_names`, names that end in `_GG`, such as `image_433_20.png`, hold the safety margin in percent. If
     `baseline` is None, `stick` for a recording of several frames and `untouched` for a folder of images.
     """
     parts = []
-    for opened in open_source(folder, reference=reference, sensor=sensor):
+    for capture in open_source(source, **facts):
+        opened = assume_reference(network, capture)
         default = "stick" if opened.files is None and len(opened) > 1 else "untouched"
         chosen = default if baseline is None else baseline
-        part = _take(network, opened, range(len(opened)), source="real", baseline=chosen)
-        part = replace(part, trial=(folder.name if opened.files else opened.trial,) * len(part.ids))
+        origin = "simulated" if opened.simulated else "real"
+        part = _take(network, opened, range(len(opened)), source=origin, baseline=chosen)
+        part = replace(
+            part,
+            trial=(Path(opened.opened).name if opened.files else opened.trial,) * len(part.ids),
+            warnings=(*part.warnings, *opened.notes[len(capture.notes) :]),
+        )
         if labels_in_names:
             margin = []
             for name in part.ids:
                 if (label := _LABEL.search(name)) is None:
                     raise InputError(
-                        f"{folder / name} carries no label; its name must end in the safety margin in percent, "
-                        "as in _20.png"
+                        f"{name} of {opened.opened} carries no label; its name must end in the safety margin in "
+                        "percent, as in _20.png"
                     )
                 margin.append(int(label[1]) / 100)
             part = replace(part, safety_margin=np.array(margin, dtype=np.float32))

@@ -17,7 +17,6 @@ from threadpoolctl import threadpool_limits
 from sliplens.errors import InputError, RecordingError, SourceError
 from sliplens.extras import import_cv2, missing_packages, require_keywords
 from sliplens.friction import Friction
-from sliplens.images import read_image
 from sliplens.live.contract import LiveOptions, LiveSource
 from sliplens.live.frame_reader import FrameReader, ReaderSettings, ReferenceTaker
 from sliplens.live.mailbox import Mailbox, Outlet
@@ -31,6 +30,7 @@ from sliplens.models.wrapping import open_run
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import Dataset, save_profile
 from sliplens.recordings.sensor import load_profile
+from sliplens.recordings.source import read_reference
 from sliplens.recordings.trial import TrialFacts
 
 Subscriber = Callable[[Reading, LiveFrame | None], None]
@@ -139,7 +139,7 @@ class LiveReader(FrameReader):
         if run is not None and profile is None:
             options = replace(options, fit_size=run.manifest.frame_size)
         super().__init__(open_live(source, options=options), run, **settings)
-        untouched = read_image(Path(reference)) if isinstance(reference, Path | str) else reference
+        untouched = None if reference is None else read_reference(reference)
         self.recorder: Recorder | None = None
         """Recorder, while it records."""
         self.outputs: tuple[Outlet, ...] = ()

@@ -157,8 +157,9 @@ def predict(
         out: `predict("cup.mp4")` uses the network that the sensor's profile names, else `chromatouch-pair`, or
         `chromatouch-difference` for difference images.
     source
-        Data set, folder of images, video, bag, uint8 RGB frames (frames, height, width, 3), or captures of
-        `open_source`. Images without a reference are taken for difference images, compared before.
+        Data set or one of its trials (`Dataset.load`), folder of images, video, bag, uint8 RGB frames (frames, height,
+        width, 3), a list of images or their paths, or captures of `open_source`. Images without a reference are taken
+        for difference images, compared before.
     friction
         Coefficient of friction of the object, for a network that predicts F_t / F_n: a number, (low, high), or a
         `Friction`, such as one learnt from slips (docs/networks.md). If None, any friction of the training is possible.
@@ -238,9 +239,9 @@ def predict(
                 name, origin = profile.network, f"which the profile {profile.name} names"
             elif any(kind.read_reference is None and not _is_recorded(kind) for kind in trials.kinds):
                 name, origin = DIFFERENCE_NETWORK, "which comes with sliplens for difference images"
-            add_note(f"no network was named, so {name} predicts it, {origin}")
+            add_note(f"no network was named, so {name} is used, {origin}")
             network = open_run(name, device=device)
-        kinds = [_assume_reference(network, capture) for capture in trials.kinds]
+        kinds = [assume_reference(network, capture) for capture in trials.kinds]
         notes = _list_notes(network, kinds, profile, friction=prior)
         for sentence in notes:
             add_note(sentence)
@@ -285,7 +286,7 @@ def _list_notes(
     return tuple(dict.fromkeys(notes))
 
 
-def _assume_reference(network: Network, trial: Capture) -> Capture:
+def assume_reference(network: Network, trial: Capture) -> Capture:
     """Assume that the first frame of a recording shows the untouched sensor, if a network needs a reference."""
     if trial.read_reference is not None or not _is_recorded(trial) or not network.encoding.compares:
         return trial
@@ -370,7 +371,7 @@ class _Prediction(Work):
     def _tables(self, engine: Engine, read: _Read, part: tuple[str, int, int]) -> Iterator[pa.Table]:
         _, first, count = part
         capture, frames = read(*part)
-        capture = _assume_reference(self.network, capture)
+        capture = assume_reference(self.network, capture)
         network = self.network
         reference = None if capture.read_reference is None else capture.read_reference()
         check, size = _make_check(network, capture, reference), tuple(network.manifest.frame_size)

@@ -1,7 +1,7 @@
 """Recordings as they are in files: frames and forces, nothing interpreted."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import islice
 from typing import TypeAlias
 
@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 from sliplens.errors import RecordingError
 from sliplens.images import require_rgb
 from sliplens.recordings.labelling import ReferenceChoice
-from sliplens.recordings.trial import Labels, TrialFacts, require_rising
+from sliplens.recordings.trial import Labels, Recording, TrialFacts, require_rising
 
 Frame: TypeAlias = UInt8[np.ndarray, "height width 3"]  #: RGB image of the camera.
 
@@ -93,3 +93,17 @@ class Capture(TrialFacts):
         if self.time_s is None or len(self) < 2:
             return 25.0
         return float(np.clip(1 / np.median(np.diff(self.time_s)), 1, 120))
+
+
+def capture_recording(recording: Recording) -> Capture:
+    """Open a trial in memory with its labels and its reference frame."""
+    return Capture(
+        **{field.name: getattr(recording, field.name) for field in fields(TrialFacts)},
+        source=recording.trial,
+        frame_time_s=recording.time_s,
+        frame_size=(recording.reference.shape[0], recording.reference.shape[1]),
+        read_frames=recording.frames.__iter__,
+        labels=recording,
+        reference=recording.reference,
+        simulated=recording.truth is not None,
+    )

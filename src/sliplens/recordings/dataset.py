@@ -28,7 +28,7 @@ from sliplens.files import (
 from sliplens.images import encode_png, read_image
 from sliplens.progress import OnProgress, add_note, fold_equal, number_of, report_file, reporting
 from sliplens.recordings import store
-from sliplens.recordings.capture import Capture, Forces, Frame
+from sliplens.recordings.capture import Capture, Forces, Frame, capture_recording
 from sliplens.recordings.labelling import LabelBasis, Labelling, ReferenceChoice
 from sliplens.recordings.sensor import SENSORS_FOLDER, SensorProfile, load_profile, profile_text
 from sliplens.recordings.store import SCHEMA_VERSION, StoredFacts, forces_path, load_recording, read_header
@@ -137,15 +137,11 @@ class Dataset(Result):
         elif samples and measured.any():
             source = f"the frames of {info.trial}"
             forces = Forces(time_s=stored.time_s[measured], force_n=force_n[measured], source=source)
-        return Capture(
-            **{field.name: getattr(info, field.name) for field in fields(TrialFacts)},
+        return replace(
+            capture_recording(stored),
             source=f"{info.trial} of {self.folder}",
-            frame_time_s=stored.time_s,
-            frame_size=(info.height, info.width),
             read_frames=partial(store.stream_frames, trial_path(self.folder, info.trial)),
             forces=forces,
-            labels=stored,
-            reference=stored.reference,
             split=info.split,
             simulated=self.simulated,
             opened=str(self.folder),

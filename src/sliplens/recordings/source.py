@@ -11,14 +11,16 @@ import numpy as np
 from jaxtyping import UInt8
 
 from sliplens.errors import ImageError, InputError, RecordingError
-from sliplens.files import hash_file, hash_json, hash_tree
+from sliplens.files import hash_json, hash_tree
 from sliplens.images import Images, as_frames, is_image, read_image, require_rgb
-from sliplens.recordings.capture import Capture, Frame
+from sliplens.recordings.capture import Capture, Frame, capture_recording
 from sliplens.recordings.dataset import DATASET_FILE, Dataset, load_dataset
 from sliplens.recordings.formats import open_captures
+from sliplens.recordings.formats.arrays import SUFFIXES as ARRAY_SUFFIXES
 from sliplens.recordings.formats.tables import evenly_spaced, trial_name
 from sliplens.recordings.options import ReadOptions, option_flags
 from sliplens.recordings.sensor import SensorProfile, load_profile
+from sliplens.recordings.trial import Recording
 from sliplens.runner import LONGEST, Part, part
 
 Frames: TypeAlias = UInt8[np.ndarray, "frames height width 3"]  #: RGB images of the camera, one after another.
@@ -54,8 +56,8 @@ def open_source(
     Parameters
     ----------
     source
-        Data set, folder of images, recording, one image, or uint8 frames in memory as `sliplens.images.as_frames` takes
-        them.
+        Data set or one of its trials, folder of images, recording, one image, or uint8 frames as
+        `sliplens.images.as_frames` takes them.
     reference, reference_frame
         Untouched sensor: an image, or the number of the frame that shows it. If neither, that of the source.
     split, trial
@@ -149,8 +151,7 @@ class Trials:
         """Options of the source as JSON holds them; an image by its hash."""
         image = self.options.get("reference")
         if image is not None:
-            is_file = isinstance(image, Path | str)
-            image = hash_file(Path(image)) if is_file else hashlib.sha256(as_frames(image).tobytes()).hexdigest()
+            image = hashlib.sha256(read_reference(image).tobytes()).hexdigest()
         return {**self.options, "reference": image}
 
     def reader(self) -> Callable[[str, int, int], tuple[Capture, Iterator[tuple[int, Frame]]]]:
@@ -220,6 +221,8 @@ def open_trials(
 def _read_captures(
     source: Path | Images, format: str | None, options: ReadOptions, *, whole: bool
 ) -> Sequence[Capture]:
+    if isinstance(source, Recording):
+        return [capture_recording(source)]
     name, where, what, files, rate = "frames", Capture.opened, "frames", None, options.frame_rate
     if isinstance(source, Path):
         if whole or format is not None or not is_image(source):
@@ -240,6 +243,17 @@ def _read_captures(
     return [Capture(trial=name, source=where, frame_time_s=time_s, frame_size=size, read_frames=read, files=files)]
 
 
+def read_reference(image: Path | str | Images, *, what: str = "reference") -> Frame:
+    """Return one image: that in memory, that of a file, or the frame of an array on disk (.npy, .npz)."""
+    if isinstance(image, Path | str) and Path(image).suffix.lower() in ARRAY_SUFFIXES:
+        (capture,) = open_captures(Path(image), options=ReadOptions())
+        image = list(islice(capture.read_frames(), 2))
+    frames = as_frames(image, what=f"levels of the {what}")
+    if len(frames) != 1:
+        raise ImageError(f"the {what} has {len(frames)} images or more; give one")
+    return frames[0]
+
+
 def _with_reference(trial: Capture, image: Path | str | Images | None, number: int | None) -> Capture:
     """Set the image of the untouched sensor; that of the trial stays if neither image nor number is given."""
     if image is None and number is None and trial.reference is None:
@@ -250,11 +264,7 @@ def _with_reference(trial: Capture, image: Path | str | Images | None, number: i
         return replace(trial, reference=None, reference_index=number)
     if image is None:
         return trial
-    image = read_image(Path(image)) if isinstance(image, str | Path) else image
-    frames = as_frames(image, what="levels of the reference")
-    if len(frames) != 1:
-        raise ImageError(f"the reference is {len(frames)} images; give one of the untouched sensor")
-    (pixels,) = frames
+    pixels = read_reference(image)
     if pixels.shape[:2] != trial.frame_size:
         sizes = [" x ".join(map(str, size)) for size in (pixels.shape[:2], trial.frame_size)]
         raise ImageError(

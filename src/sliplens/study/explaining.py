@@ -18,14 +18,16 @@ from sliplens.explainers.frames import MARGIN_LEVELS, Baseline, ChosenFrames, Fr
 from sliplens.explainers.occlusion import marker_regions, markers_in_recording, to_network_px
 from sliplens.explainers.table import EXPLAINERS, RECOMMENDED_METHOD
 from sliplens.extras import require_keywords
-from sliplens.images import Images, as_frames, read_image
+from sliplens.images import Images
 from sliplens.models import Network
 from sliplens.models.wrapping import Preprocess, open_run
 from sliplens.plots.saliency import draw_explanation
 from sliplens.progress import OnProgress, add_note, ignore, number_of, open_stage, reporting
 from sliplens.recordings import Dataset, Recording, load_dataset
 from sliplens.recordings.dataset import DATASET_FILE
+from sliplens.recordings.options import ReadOptions, option_flags
 from sliplens.recordings.sensor import SensorProfile, load_profile
+from sliplens.recordings.source import SourceOptions, open_source, read_reference
 from sliplens.results.explanation import BASELINES, Explanation, MovedMarkers, Strip, StripReadings, load_explanation
 from sliplens.runner import Part, part
 from sliplens.simulation.trials import put_markers_back, rebuild_trial, visible_markers
@@ -48,9 +50,21 @@ class Running(TypedDict, total=False):
     """Callback for progress: number of items done, and of all items."""
 
 
+class ExplainOptions(Running, total=False):
+    """Options of `explain` besides its own parameters: facts about the source, as `predict` takes them."""
+
+    reference_frame: int | None
+    """Number of the frame that shows the untouched sensor; without a reference the first frame of a recording."""
+    trial: str | None
+    """Name of one trial of a data set or bag."""
+    format: str | None
+    """Name of the format of a recording (docs/recordings.md); recognised if not given."""
+    options: ReadOptions | None
+
+
 def explain(
     run: Network | nn.Module | Path | str,
-    source: Dataset | Path | str | Images,
+    source: Dataset | Recording | Path | str | Images,
     *,
     reference: Path | str | Images | None = None,
     baseline: Baseline | Images | Path | str | None = None,
@@ -60,7 +74,7 @@ def explain(
     sensor: SensorProfile | Path | str | None = None,
     labels_in_names: bool = False,
     out: Path | str | None = None,
-    **running: Unpack[Running],
+    **running: Unpack[ExplainOptions],
 ) -> Explanation:
     """Explain why a network predicts these safety margins rather than that of a baseline.
 
@@ -71,7 +85,8 @@ def explain(
     source, reference
         Camera frames T_n, 8-bit RGB, with the frame of the untouched sensor T_0; or a folder of images or a recording
         with the image of the untouched sensor, where it holds none. Without a reference they are absolute difference
-        images |T_n - T_0|. Or a data set, of which frames along the safety margin are taken.
+        images |T_n - T_0|. Or a data set, of which frames along the safety margin are taken, or one of its trials
+        (`Dataset.load`).
     baseline
         What predictions are compared with: `untouched`, the untouched sensor; `stick`, the last frame before the pull
         of the same trial; `black`, `mean` (the mean colour of the frames) or `blurred` (each frame blurred), for
@@ -94,7 +109,7 @@ def explain(
         Folder to write: the record, overlays of every map, and a panel of them; nothing is written if None. An
         interrupted call continues after its last map.
     running
-        Options of `Running`.
+        Options of `ExplainOptions`.
 
     Raises
     ------
@@ -131,9 +146,10 @@ def explain(
     network = open_run(run, device=running.get("device", "cpu"), preprocess=running.get("preprocess"))
     profile = None if sensor is None else load_profile(sensor)
     compared = _open_baseline(baseline, profile)
-    chosen = _choose(
-        network, source, reference, select, sensor=profile, labels_in_names=labels_in_names, baseline=compared
-    )
+    facts: SourceOptions = {"reference": reference, "sensor": profile, "trial": running.get("trial")}
+    facts |= {"reference_frame": running.get("reference_frame"), "options": running.get("options")}
+    facts |= {"format": running.get("format")}
+    chosen = _choose(network, source, select, facts, labels_in_names=labels_in_names, baseline=compared)
     explainers, warnings = choose_explainers(network, chosen, method, budget=budget)
     frames = number_of(len(chosen.ids), "frame")
     title = f"Explaining {frames} ({network.manifest.input}, {chosen.source})"
@@ -168,50 +184,46 @@ def explain(
 
 def _choose(
     network: Network,
-    source: Dataset | Path | str | Images,
-    reference: Path | str | Images | None,
+    source: Dataset | Recording | Path | str | Images,
     select: FrameSelection | None,
+    facts: SourceOptions,
     *,
-    sensor: SensorProfile | None,
     labels_in_names: bool,
     baseline: Baseline | None,
 ) -> ChosenFrames:
     if isinstance(source, str | Path) and (Path(source) / DATASET_FILE).is_file():
         source = load_dataset(source)
     if isinstance(source, Dataset):
-        if sensor is not None:
-            raise InputError("a data set's frames went through their profile on import; leave out --sensor")
+        trial = facts.pop("trial")
+        if given := [name for name, fact in facts.items() if fact is not None]:
+            raise InputError(
+                f"the trials of a data set bring their reference and facts; leave out {option_flags(given)}"
+            )
         selection = select or FrameSelection()
+        if trial is not None:
+            info = source.find(trial)
+            source = replace(source, trials=(info,))
+            selection = replace(selection, split=info.split, condition=info.condition)
         return choosing.frames_from_dataset(
             network, source, selection, baseline="stick" if baseline is None else baseline
         )
-    if not isinstance(source, str | Path):
-        image = read_image(Path(reference)) if isinstance(reference, str | Path) else reference
-        if image is not None:
-            images = as_frames(image, what="levels of the reference")
-            if len(images) != 1:
-                raise InputError(f"the reference has {len(images)} images; give one of the untouched sensor")
-            image = images[0]
-        return choosing.frames_from_arrays(
-            network, as_frames(source), image, baseline="untouched" if baseline is None else baseline
-        )
-    return choosing.frames_from_folder(
-        network, Path(source), reference=reference, labels_in_names=labels_in_names, sensor=sensor, baseline=baseline
-    )
+    if isinstance(source, str | Path | Recording):
+        return choosing.frames_from_folder(network, source, labels_in_names=labels_in_names, baseline=baseline, **facts)
+    (opened,) = open_source(source, **facts)
+    untouched = None if opened.read_reference is None else opened.read_reference()
+    frames = np.stack([*opened.read_frames()])
+    return choosing.frames_from_arrays(network, frames, untouched, baseline=baseline or "untouched")
 
 
 def _open_baseline(baseline: Baseline | Images | Path | str | None, profile: SensorProfile | None) -> Baseline | None:
     """Read the image of a baseline, and fit it to the network's sensor by its profile."""
     if baseline is None or (isinstance(baseline, str) and baseline in BASELINES and baseline != "given"):
         return cast("Baseline | None", baseline)
-    if isinstance(baseline, str | Path):
-        if not Path(baseline).is_file():
-            raise InputError(
-                f"the baseline {baseline} is no image; give untouched, stick, black, mean, blurred, or the path of an "
-                "image"
-            )
-        baseline = read_image(Path(baseline))
-    image = as_frames(baseline, what="levels of the baseline")[0]
+    if isinstance(baseline, str | Path) and not Path(baseline).is_file():
+        raise InputError(
+            f"the baseline {baseline} is no image; give untouched, stick, black, mean, blurred, or the path of an image"
+        )
+    image = read_reference(baseline, what="baseline")
     return image if profile is None else profile.apply(image)
 
 

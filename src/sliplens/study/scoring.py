@@ -31,6 +31,7 @@ from sliplens.intervals import paired_difference
 from sliplens.models import Network
 from sliplens.models.wrapping import open_run
 from sliplens.progress import open_stage, report_each, reporting
+from sliplens.recordings.source import read_reference
 from sliplens.results.explanation import Explanation, MethodNotes, load_explanation, require_saliency
 from sliplens.results.faithfulness import CHANCE, NEW_WEIGHTS, DeletionScores, Faithfulness, MethodGap, RemovalCurve
 from sliplens.results.study import REDRAWN, SETTINGS, MapMeasures, MapQuality, MarkerTable, Setting, UntrainedMaps
@@ -56,7 +57,7 @@ def score(
     frames: Images | Explanation | Path | str,
     maps: Explanation | Maps | None = None,
     *,
-    reference: Images | None = None,
+    reference: Path | str | Images | None = None,
     signed: bool = True,
     fill: str = "reference",
     unit: Literal["pixel", "tile"] = "pixel",
@@ -182,7 +183,7 @@ def _to_score(
     network: Network,
     frames: Images | Explanation | Path | str,
     maps: Explanation | Maps | None,
-    reference: Images | None,
+    reference: Path | str | Images | None,
     *,
     signed: bool,
 ) -> Explanation:
@@ -203,7 +204,7 @@ def _to_score(
         raise SaliencyError(f"there are {count} maps of {len(frames)} frames; explain the frames that are scored")
     if not isinstance(maps, np.ndarray):
         return maps
-    untouched = None if reference is None else as_frames(reference, what="levels of the reference")[0]
+    untouched = None if reference is None else read_reference(reference)
     explanation = join_maps(network, frames_from_arrays(network, frames, untouched), {})
     for index, values in enumerate(maps):
         require_saliency(values, explanation.images.shape[-2:], where=f"map {index}")
