@@ -3,12 +3,14 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import torchvision
 from captum.attr import DeepLift
+from PIL import Image
 from torch import Tensor, nn
 
 import sliplens as sl
@@ -184,3 +186,42 @@ def test_an_explanation_names_the_weights_of_its_module(frames: np.ndarray):
         sl.score(outputs[0], sl.explain(outputs[1], frames, method="integrated-gradients"))
     same = sl.wrap(small_module(), size=SIZE)
     assert sl.score(replace(same), explanation, random_orders=1, steps=0).frames == len(frames)
+
+
+def write_array(image: np.ndarray, path: Path) -> Path:
+    np.savez(path, untouched=image) if path.suffix == ".npz" else np.save(path, image)
+    return path
+
+
+def write_image(image: np.ndarray, path: Path) -> Path:
+    Image.fromarray(image).save(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("form", "reference_only"),
+    [
+        (lambda image, folder: write_image(image, folder / f"{image.sum()}.png"), False),
+        (lambda image, folder: str(write_image(image, folder / f"{image.sum()}.bmp")), False),
+        (lambda image, _: Image.fromarray(image), False),
+        (lambda image, _: torch.from_numpy(image).permute(2, 0, 1), False),
+        (lambda image, folder: write_array(image, folder / "untouched.npy"), True),
+        (lambda image, folder: str(write_array(image, folder / "untouched.npz")), True),
+        (lambda image, _: [image], True),
+    ],
+    ids=["path", "text", "Pillow", "tensor", "npy", "npz", "list"],
+)
+def test_frames_and_reference_of_every_form_are_the_same(
+    frames: np.ndarray, form: Callable, reference_only: bool, tmp_path: Path
+):
+    network = sl.wrap(small_module(), size=SIZE, encoding="difference")
+    images, untouched = frames[1:], frames[0]
+    given = images if reference_only else [form(image, tmp_path) for image in images]
+    results = []
+    for shown, reference in ((images, untouched), (given, form(untouched, tmp_path))):
+        options = {"reference": reference}
+        maps = sl.explain(network, shown, method="integrated-gradients", baseline=reference, **options)
+        score = sl.score(network, shown, maps.relevance["integrated-gradients"], random_orders=1, steps=0, **options)
+        table = sl.predict(network, shown, **options).to_arrow()
+        results.append((table["prediction"].to_pylist(), maps.relevance["integrated-gradients"].tolist(), score.scores))
+    assert results[0] == results[1]

@@ -17,11 +17,13 @@ from sliplens.explainers.table import RECOMMENDED_METHOD
 from sliplens.files import output_folder
 from sliplens.models import Network
 from sliplens.recordings import Dataset, Recording
+from sliplens.recordings.options import ReadOptions
 from sliplens.results.explanation import Explanation, Strip, load_explanation
 from sliplens.simulation.trials import put_markers_back, rebuild_trial, visible_markers
 from sliplens.study.explaining import explain, make_strip, prove_map
 
 from ..conftest import make_recording
+from ..helpers.own_recording import write_video
 
 METHODS = ("grad-cam", "integrated-gradients")
 MakeMaps = Callable[..., Explanation]
@@ -137,6 +139,29 @@ def test_a_strip_compares_with_the_last_frame_before_the_pull(strip, network):
 
 def test_a_strip_is_explanation_by_the_recommended_method_of_tiles_where_no_markers_show(strip):
     assert strip.method == RECOMMENDED_METHOD.removesuffix("-marker")
+
+
+def test_explain_takes_the_facts_that_predict_takes(network: Network, small_dataset: Dataset, tmp_path: Path):
+    recording = small_dataset.load(small_dataset.trials[-1])
+    video = write_video(recording, tmp_path / "cup.mkv")
+    options = {"method": "grad-cam"}
+    chosen = explain(network, small_dataset, trial=recording.trial, select=FrameSelection(levels=(0.0,)), **options)
+    assert list(chosen.trials) == [recording.trial]
+    whole = explain(network, recording, **options)  # with its labels, which name the stick frame
+    assert whole.baseline == "stick"
+    row = int(chosen.frames[0].id.rpartition("f")[2])
+    np.testing.assert_allclose(whole.relevance["grad-cam"][row], chosen.relevance["grad-cam"][0], atol=1e-6)
+    # an untouched frame is taken for the reference, as by `predict`
+    shown = replace(network, manifest=replace(network.manifest, input="signed"))
+    for source, facts in ((video, {}), (str(video), {"format": "video", "options": ReadOptions(frame_rate=25.0)})):
+        assumed = explain(shown, source, baseline="untouched", **options, **facts)
+        assert "first frame was taken for the untouched sensor" in " ".join(assumed.methods["grad-cam"].warnings)
+        given = explain(shown, source, baseline="untouched", **options, **facts, reference_frame=0)
+        np.testing.assert_array_equal(assumed.images, given.images)
+        assert len(assumed.frames) == sl.predict(shown, source, **facts).frames
+    for facts in ({"reference": recording.reference}, {"reference_frame": 0}, {"options": ReadOptions()}):
+        with pytest.raises(InputError, match=f"leave out --{next(iter(facts)).replace('_', '-')}"):
+            explain(network, small_dataset, **facts)
 
 
 def test_a_strip_reads_as_the_network_does(strip, network):

@@ -250,8 +250,9 @@ def frames_from_folder(
     """Choose all images of a folder, in natural order, or all frames of a recording that `open_source` opens.
 
     They are camera frames if the `facts`, those of `open_source`, or the source name a reference, or the network
-    compares frames of a recording, else absolute difference images |T_n - T_0|. If `labels_in_names`, names that end in `_GG`, such as `image_433_20.png`, hold the safety margin in percent. If
-    `baseline` is None, `stick` for a recording of several frames and `untouched` for a folder of images.
+    compares frames of a recording, else absolute difference images |T_n - T_0|. If `labels_in_names`, names that end in
+    `_GG`, such as `image_433_20.png`, hold the safety margin in percent. If `baseline` is None, `stick` for a recording
+    of several frames and `untouched` for a folder of images.
     """
     parts = []
     for capture in open_source(source, **facts):

@@ -221,8 +221,6 @@ def open_trials(
 def _read_captures(
     source: Path | Images, format: str | None, options: ReadOptions, *, whole: bool
 ) -> Sequence[Capture]:
-    if isinstance(source, Recording):
-        return [capture_recording(source)]
     name, where, what, files, rate = "frames", Capture.opened, "frames", None, options.frame_rate
     if isinstance(source, Path):
         if whole or format is not None or not is_image(source):
@@ -233,11 +231,13 @@ def _read_captures(
             return captures
         name, where, what, files = trial_name(source.stem), str(source), f"frames of {source}", (source.name,)
         source = read_image(source)
+    if strange := [option for option in options.given() if option != "frame_rate"]:
+        raise InputError(f"{where} do not take {option_flags(strange)}; leave it out")
+    if isinstance(source, Recording):
+        return [capture_recording(source)]
     frames = as_frames(source, what=what)
     if not len(frames):
         raise InputError("there is no frame; give one or more")
-    if strange := [option for option in options.given() if option != "frame_rate"]:
-        raise InputError(f"{where} do not take {option_flags(strange)}; leave it out")
     time_s = np.full(len(frames), np.nan) if rate is None else evenly_spaced(len(frames), frame_rate=rate)
     read, size = frames.__iter__, frames.shape[1:3]
     return [Capture(trial=name, source=where, frame_time_s=time_s, frame_size=size, read_frames=read, files=files)]

@@ -196,9 +196,7 @@ def _choose(
     if isinstance(source, Dataset):
         trial = facts.pop("trial")
         if given := [name for name, fact in facts.items() if fact is not None]:
-            raise InputError(
-                f"the trials of a data set bring their reference and facts; leave out {option_flags(given)}"
-            )
+            raise InputError(f"the trials of a data set bring their own facts; leave out {option_flags(given)}")
         selection = select or FrameSelection()
         if trial is not None:
             info = source.find(trial)
@@ -212,7 +210,8 @@ def _choose(
     (opened,) = open_source(source, **facts)
     untouched = None if opened.read_reference is None else opened.read_reference()
     frames = np.stack([*opened.read_frames()])
-    return choosing.frames_from_arrays(network, frames, untouched, baseline=baseline or "untouched")
+    baseline = "untouched" if baseline is None else baseline
+    return choosing.frames_from_arrays(network, frames, untouched, baseline=baseline)
 
 
 def _open_baseline(baseline: Baseline | Images | Path | str | None, profile: SensorProfile | None) -> Baseline | None:
