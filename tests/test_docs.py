@@ -1,23 +1,35 @@
-"""What the documentation and its gallery name is there: imports, calls and their arguments, files."""
+"""Code of the documentation runs, its commands are there, and what it names: imports, arguments, files."""
 
 import ast
-import functools
 import importlib
 import inspect
 import re
 import runpy
+import shlex
+import shutil
 import tomllib
 from collections.abc import Iterator
+from dataclasses import replace
+from functools import wraps
 from pathlib import Path
+from typing import Any, NamedTuple
 
+import cyclopts
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from command_line import typed
+from own_recording import write_forces, write_frames
+from simulated_data import simulate_recipe
 
 import sliplens
 from house import sentences
 from sliplens.cli.app import adapt
 from sliplens.cli.commands import COMMANDS
+from sliplens.images import write_png
+from sliplens.live import LiveReader
+from sliplens.simulation import SimulationRecipe
+from sliplens.training.config import RECIPES
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "examples").rglob("plot_*.py"))
@@ -27,22 +39,37 @@ PAGE = pytest.mark.parametrize(
 )
 
 
+MARKDOWN = pytest.mark.parametrize(
+    "page", [page for page in PAGES if page.suffix == ".md" and page.name != "CHANGELOG.md"], ids=lambda page: page.stem
+)
+
 NO_MODULES = (
     {f"sliplens.{name}" for name in ("fills", "formats", "encodings", "backbones", "executors", "controllers")}
     | {f"sliplens.{name}" for name in ("manifest", "input", "output", "recipes", "augmentations", "sources")}
     | {"sliplens.sinks"}
 )
 """Groups of entry points, and keys in the metadata of an ONNX file."""
-_CODE = re.compile(r"^```(\w*)\n(.*?)^```", flags=re.MULTILINE | re.DOTALL)
+_CODE = re.compile(r"^```(\w*) ?(.*)\n((?:.*\n)*?)```", flags=re.MULTILINE)
+
+
+class Block(NamedTuple):
+    """Code of a page; of its fence a reader sees the language alone, and `mark` says why it is not run here."""
+
+    language: str
+    mark: str
+    code: str
+    line: int
+
+
+def blocks_of(page: Path) -> list[Block]:
+    text = page.read_text(encoding="utf-8")
+    if page.suffix == ".py":
+        return [Block("python", "", text, 1)]
+    return [Block(*found.groups(), text.count("\n", 0, found.start(3))) for found in _CODE.finditer(text)]
 
 
 def code_of(page: Path) -> list[ast.Module]:
-    text = page.read_text(encoding="utf-8")
-    return (
-        [ast.parse(code) for kind, code in _CODE.findall(text) if kind == "python"]
-        if page.suffix == ".md"
-        else [ast.parse(text)]
-    )
+    return [ast.parse(block.code) for block in blocks_of(page) if block.language == "python"]
 
 
 def text_of(page: Path) -> str:
@@ -125,37 +152,96 @@ def test_where_a_page_links_to_there_is_a_file_with_its_heading(page: Path):
         assert not anchor or anchor in anchors_of(target), f"{path}#{anchor}"
 
 
-def command_lines(code: str) -> list[list[str]]:
-    """Words of each command of sliplens in a block, without what is said of it."""
-    lines = (line.partition("#")[0].split() for line in code.splitlines())
-    return [words[1:] for words in lines if words[:1] == ["sliplens"] and words[1:] != ["--version"]]
+def command_lines(page: Path) -> Iterator[tuple[str, list[str]]]:
+    """Name and words of each command of sliplens on a page, and the mark of its block in front of them."""
+    for block in blocks_of(page):
+        lines = [] if block.language == "python" else block.code.replace("\\\n", "").splitlines()
+        for words in (shlex.split(line, comments=True) for line in lines):
+            if words[:1] == ["sliplens"] and words[1:] != ["--version"]:
+                name = " ".join(words[1:3]) if " ".join(words[1:3]) in COMMANDS else words[1]
+                yield name, words[1 + len(name.split()) :]
 
 
 @PAGE
 def test_what_a_page_trains_and_evaluates_on_has_trials_for_it(page: Path):
-    for _, code in _CODE.findall(page.read_text(encoding="utf-8")):
-        commands = command_lines(code)
-        imported = {words[words.index("-o") + 1]: words for words in commands if words[0] == "import"}
-        for words in commands:
-            for data in imported.keys() & set(words[1:]):
-                needed = {"train": "--validation-trials", "evaluate": "--test-trials"}.get(words[0])
-                assert needed is None or {needed, "--splits"} & set(imported[data]), words
+    commands = list(command_lines(page))
+    imported = {words[words.index("-o") + 1]: words for name, words in commands if name == "import"}
+    for name, words in commands:
+        for data in imported.keys() & set(words):
+            needed = {"train": "--validation-trials", "evaluate": "--test-trials"}.get(name)
+            assert needed is None or {needed, "--splits"} & set(imported[data]), words
 
 
-@functools.cache
-def options_of(name: str) -> set[str]:
-    """Options of a command of sliplens."""
-    _, names = adapt(COMMANDS[name])
-    options = {f"--{prefix}{name.replace('_', '-')}" for name in names for prefix in ("", "no-")}
-    return options | {alias for _, alias in COMMANDS[name].aliases} | {"-o", "--output", "--help"}
-
-
-@pytest.mark.parametrize("page", [page for page in PAGES if page.suffix == ".md"], ids=lambda page: page.stem)
+@MARKDOWN
 def test_what_a_page_types_is_a_command_with_its_options(page: Path):
-    for _, code in _CODE.findall(page.read_text(encoding="utf-8")):
-        for words in command_lines(code):
-            name = " ".join(words[:2]) if " ".join(words[:2]) in COMMANDS else words[0]
-            assert {word.partition("=")[0] for word in words if re.match(r"--?[a-z]", word)} <= options_of(name)
+    for name, words in command_lines(page):
+        app = cyclopts.App(result_action="return_value")
+        app.default(adapt(COMMANDS[name])[0])
+        app.parse_args(words, exit_on_error=False, print_error=False)
+
+
+@pytest.fixture(scope="module")
+def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with the files that pages name: a data set, a network, a recording."""
+    folder = tmp_path_factory.mktemp("workshop")
+    data = simulate_recipe(
+        folder / "runs/mine/data",
+        SimulationRecipe(dry_trials=5, wet_trials=1, days=3, frames_per_trial=20, release=True),
+    )
+    simulate_recipe(folder / "OTHER", SimulationRecipe(dry_trials=3, wet_trials=0, days=2, frames_per_trial=8, seed=9))
+    shutil.copytree(ROOT / "src/sliplens/weights/chromatouch-pair", folder / "runs/mine/train")
+    for name in ("DATA", "data", "RUN", "run"):
+        (folder / name).symlink_to("runs/mine/data" if name.lower() == "data" else "runs/mine/train")
+    trial = data.load(data.trials[0])
+    for name in ("cup", "tip", "grasp"):
+        write_frames(folder / f"{name}.mp4", trial.frames, codec="libx264", pixels="yuv420p", rate=30)
+        write_forces(trial, folder / f"{name}.csv")
+    write_frames(folder / "clip.avi", trial.frames, rate=30)
+    for name, image in [("untouched", trial.reference), ("UNTOUCHED", trial.reference), ("frame", trial.frames[8])]:
+        write_png(folder / f"{name}.png", image)
+    for number, frame in enumerate(trial.frames):
+        write_png(folder / f"frames/frame-{number}.png", frame)
+    return folder
+
+
+@pytest.fixture
+def hurry(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run live for half a second, and train for an epoch of two batches."""
+    begin = LiveReader.__init__
+
+    @wraps(begin)
+    def begin_short(self: LiveReader, *args: Any, seconds: float | None = None, **options: Any) -> None:
+        begin(self, *args, seconds=0.5, **options)
+
+    monkeypatch.setattr(LiveReader, "__init__", begin_short)
+    monkeypatch.setitem(RECIPES, "adapt", replace(RECIPES["adapt"], epochs=1, epoch_frames=64))
+
+
+@pytest.fixture
+def desk(workshop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hurry: None) -> Path:
+    """Copy of the workshop, as the folder to work in."""
+    monkeypatch.chdir(shutil.copytree(workshop, tmp_path / "desk", symlinks=True))
+    return Path.cwd()
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page.suffix == ".md" and code_of(page)], ids=lambda page: page.stem)
+def test_the_python_of_a_page_runs_from_top_to_bottom(page: Path, desk: Path):
+    """Blocks of the README are pasted one at a time."""
+    names: dict[str, Any] = {}
+    for block in blocks_of(page):
+        if block.language == "python" and not block.mark:
+            lines = "\n" * block.line + block.code
+            exec(compile(lines, page, "exec"), {} if page.name == "README.md" else names)
+
+
+QUICK = {"check", "recover", "predict", "track", "split", "label", "sensor new", "export onnx"}
+
+
+@MARKDOWN
+def test_quick_commands_of_a_page_run(page: Path, desk: Path):
+    for name, words in command_lines(page):
+        if name in QUICK:
+            typed(*name.split(), *words)
 
 
 def rows_of(page: str) -> list[list[str]]:
