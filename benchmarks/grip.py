@@ -257,10 +257,10 @@ def compare_all(options: argparse.Namespace, rng: np.random.Generator) -> dict[s
         found["r2"] = {f"{scale:g}": round(accuracy(READINGS, scale, rng=rng), 3) for scale in SCALES}
         found["target"] = swept(TARGETS, lambda value: hold("margin", {"target": value}, fewer))
         groups = {"all": rows, **{name: labels[some] == name for name in conditions}}
-        found["friction_told"] = {}
+        found["known_friction"] = {}
         for how in TOLD:
             own = hold("margin", {}, fewer, friction=tell(how, fewer, rng))
-            found["friction_told"][how] = {name: compare(own, beside, one, rng) for name, one in groups.items()}
+            found["known_friction"][how] = {name: compare(own, beside, one, rng) for name, one in groups.items()}
     if options.rendered:
         found["validation"] = validate(options.rendered, conditions, rng)
     return found

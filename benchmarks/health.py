@@ -8,7 +8,7 @@ stale` and `frozen` half of the picture, or all of it under fresh noise, has sto
 where it errs by more than 0.2, or without contact. `shown_wrong_share` is the share of frames off and not withheld.
 
 `auroc` ranks all these frames by `margin_risk`, in which all checks and the network's own spread are one number, and
-`auroc_worst` by how far their worst check is from its limit. `auroc_told` is the best that can be reached: ranking by
+`auroc_worst` by how far their worst check is from its limit. `auroc_true_fault` is the best that can be reached: ranking by
 the true fault and strength, and how often it put the margins of the other trials off. `seen_by_network` is the AUROC of
 each fault against frames without one, by `Estimate.known`. `withheld_healthy` is the share of healthy frames withheld.
 
@@ -376,11 +376,11 @@ def summarise(cases: list[Case]) -> dict[str, object]:
     return {
         "auroc": auroc(risk[off], risk[~off]),
         "auroc_worst": auroc(worst[off], worst[~off]),
-        "auroc_told": auroc(told[off], told[~off]),
+        "auroc_true_fault": auroc(told[off], told[~off]),
         "seen_by_network": {name: auroc(-known[kinds == name], -known[healthy]) for name in faults}
         | {"all": auroc(-known[~healthy], -known[healthy])},
         "withheld_healthy": float(np.mean([bool(case.failed) for case in by_fault["none"]])),
-        "off_told": float(np.mean([bool(case.failed) for case, wrong in zip(cases, off, strict=True) if wrong])),
+        "errors_withheld": float(np.mean([bool(case.failed) for case, wrong in zip(cases, off, strict=True) if wrong])),
         "by_fault": {name: count_withheld(some) for name, some in by_fault.items()},
         "frames": len(cases),
     }  # fmt: skip

@@ -223,7 +223,7 @@ def load_at(name: str, image_size: int | None = None) -> Network:
 RATIOS = {
     "pair": ("pair", "difference"),
     "pair_at_224": ("pair_at_224", "difference"),
-    "pair_told": ("pair_told", "difference_told"),
+    "pair_friction": ("pair_friction", "difference_friction"),
 }
 """Ways to read that are compared, the one over the other."""
 
@@ -233,7 +233,7 @@ def measure_in_turn(frames: np.ndarray, untouched: np.ndarray, *, rounds: int) -
     ways: dict[str, tuple[Network, dict]] = {"pair_at_224": (load_at("chromatouch-pair", 224), {})}
     for name in ("difference", "pair"):
         network = load_at(f"chromatouch-{name}")
-        for suffix, options in (("", {}), ("_told", {"friction": (0.3, 0.9)})):
+        for suffix, options in (("", {}), ("_friction", {"friction": (0.3, 0.9)})):
             ways[name + suffix] = network, options
     readers = {
         name: sl.LiveReader(TurnSource(), network, reference=untouched, stall_s=3600, **options)

@@ -196,7 +196,7 @@ def r2_over_days(name: str, truth: np.ndarray, answer: np.ndarray, days: np.ndar
 
 @dataclass(frozen=True, kw_only=True)
 class Read:
-    """What a network answers to frames of a set, trial by trial, by what it is told; and the truth of all frames."""
+    """Predictions of a network for frames of a set, trial by trial, by the friction given to it; and all true values."""
 
     estimates: dict[str, list[Estimate]]
     margin: Float[np.ndarray, " frames"]
@@ -205,12 +205,12 @@ class Read:
     wet: Bool[np.ndarray, " frames"]
 
     def answers(self, name: str) -> Float[np.ndarray, " frames"]:
-        """Margins where so much is told."""
+        """Margins under this knowledge of the friction."""
         return np.concatenate([one.margin for one in self.estimates[name]])
 
 
 def read_frames(run: Network, name: str, *, trials: int | None = None) -> Read:
-    """Read a few frames of each trial of a set, told more or less of its friction."""
+    """Predict a few frames of each trial of a set, with more or less knowledge of its friction."""
     rng = np.random.default_rng(DRAWS[name])
     estimates: dict[str, list[Estimate]] = {}
     truth, ratios, days, wet = [], [], [], []
@@ -224,8 +224,8 @@ def read_frames(run: Network, name: str, *, trials: int | None = None) -> Read:
         known: dict[str, Friction] = {}
         if slipped is not None:
             known = {
-                "told": Friction(friction),
-                "told_within_10": Friction.between((1 - WITHIN) * wrong, (1 + WITHIN) * wrong),
+                "known_friction": Friction(friction),
+                "friction_within_10": Friction.between((1 - WITHIN) * wrong, (1 + WITHIN) * wrong),
                 "one_slip": learn(slipped),
             }
         for what, one in known.items():
@@ -239,7 +239,7 @@ def read_frames(run: Network, name: str, *, trials: int | None = None) -> Read:
 
 
 def summarise(read: Read) -> dict[str, Any]:
-    """R2 of the margin by what is told, dry and wet, with intervals; what the 90 % intervals hold; what is `known`."""
+    """R2 of the margin by knowledge of the friction, dry and wet; coverage of the 90 % intervals; `known`."""
     one_frame = read.estimates["one_frame"]
     ratios = [one.ratio for one in one_frame if one.ratio is not None]
     is_known = [one.known for one in one_frame if one.known is not None]
@@ -267,7 +267,7 @@ def lead(
 
 
 def leads(read: Read, other: Read) -> dict[str, float]:
-    """What one network is ahead of another on the same frames, by what is told to both."""
+    """Lead in R2 of one network over another on the same frames, by knowledge of the friction."""
     found: dict[str, float] = {}
     for name in read.estimates.keys() & other.estimates.keys():
         for condition, rows in (("dry", ~read.wet), ("wet", read.wet)):

@@ -116,8 +116,8 @@ def run_clips(folder: Path) -> dict[str, float | int]:
             continue
         told[clip.slipped].append(SlipState.SLIP in states)
     return {
-        "slip_clips": len(told[True]), "told_in_slip_clips": float(np.mean(told[True] or [np.nan])),
-        "holding_clips": len(told[False]), "told_in_holding_clips": float(np.mean(told[False] or [np.nan])),
+        "slip_clips": len(told[True]), "detected_in_slip_clips": float(np.mean(told[True] or [np.nan])),
+        "holding_clips": len(told[False]), "detected_in_holding_clips": float(np.mean(told[False] or [np.nan])),
         "failed": failed,
     }  # fmt: skip
 
