@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from small import network_of
 from torch import Tensor, nn
 
 import sliplens as sl
@@ -13,7 +14,6 @@ from sliplens.explainers.explain import network_references
 from sliplens.explainers.frames import FrameSelection, find_stick_frame
 from sliplens.images import write_png
 from sliplens.models import Network
-from sliplens.models.checkpoint import Manifest
 from sliplens.recordings import Dataset, Recording
 
 SELECT = FrameSelection(levels=(1.0, 0.5, 0.0))
@@ -37,9 +37,7 @@ def run(request: pytest.FixtureRequest) -> Network:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         model = Waves(6 if request.param == "pair" else 3)
-    size = (48, 48)
-    manifest = Manifest(backbone="waves", input=request.param, image_size=32, frame_size=size, sensor="", data_hash="")
-    return Network(model=model.eval(), manifest=manifest)
+    return network_of(model, input=request.param, image_size=32, frame_size=48)
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ from functools import partial
 import pytest
 import torch
 from quick import QUICK, saliency
-from torch import nn
+from small import Returning
 
 from sliplens.errors import ImageError, InputError, ModelError
 from sliplens.explainers.gradients import SmoothGrad
@@ -23,17 +23,6 @@ pytestmark = pytest.mark.usefixtures("short_guess")
 every_explainer = pytest.mark.parametrize("name", NAMES)
 CAMS = ["grad-cam", "poly-cam"]
 HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
-
-
-class Affine(nn.Module):
-    """scale x f + shift of a network."""
-
-    def __init__(self, network: nn.Module, *, scale: float, shift: float) -> None:
-        super().__init__()
-        self.network, self.scale, self.shift = network, scale, shift
-
-    def forward(self, images):
-        return self.scale * self.network(images) + self.shift
 
 
 def state_of(model: nn.Module):
@@ -131,7 +120,7 @@ def test_a_batch_gives_what_its_images_alone_give(name, network, images):
 def test_affine_law(name, scale, network, images, reference):
     model = network("small shufflenet")
     plain = QUICK[name](model, images, reference=reference)
-    scaled = QUICK[name](Affine(model, scale=scale, shift=0.4), images, reference=reference)
+    scaled = QUICK[name](Returning(lambda answers: scale * answers + 0.4, model), images, reference=reference)
     expected = scale * plain.relevance
     torch.testing.assert_close(scaled.relevance, expected, atol=1e-5 * float(expected.abs().max()), rtol=0)
     # the evidence for the change is the same, whichever way the output points; Grad-CAM's sign is the output's own
@@ -175,16 +164,9 @@ def test_gradients_and_precision_of_the_caller_change_nothing(name, mode, networ
 
 @every_explainer
 def test_outputs_with_and_without_an_axis_of_one_agree(name, network, images):
-    class Flat(nn.Module):
-        def __init__(self, network: nn.Module) -> None:
-            super().__init__()
-            self.network = network
-
-        def forward(self, images):
-            return self.network(images)[:, 0]
-
     model = network("small shufflenet")
-    torch.testing.assert_close(QUICK[name](Flat(model), images[:1]).relevance, QUICK[name](model, images[:1]).relevance)
+    flat = Returning(lambda answers: answers[:, 0], model)
+    torch.testing.assert_close(QUICK[name](flat, images[:1]).relevance, QUICK[name](model, images[:1]).relevance)
 
 
 @every_explainer
@@ -200,11 +182,12 @@ def test_reference_defaults_to_zeros_and_may_be_shared(name, network, images):
 
 @every_explainer
 def test_a_reference_without_a_margin_is_told(name, network, images):
-    model = Affine(network("small shufflenet"), scale=1.0, shift=0.0)
-    assert not any("no safety margin" in text for text in QUICK[name](model, images[:1], reference=images[1]).warnings)
-    model.shift = 5.0
-    warnings = QUICK[name](model, images[:1], reference=images[1]).warnings
-    assert any("is no safety margin, so the reference lies far from the data" in text for text in warnings)
+    model = network("small shufflenet")
+    for shift in (0.0, 5.0):
+        shifted = Returning(lambda answers, shift=shift: answers + shift, model)
+        warnings = QUICK[name](shifted, images[:1], reference=images[1]).warnings
+        told = any("is no safety margin, so the reference lies far from the data" in text for text in warnings)
+        assert told == (shift > 0)
 
 
 @every_explainer
@@ -249,15 +232,6 @@ def test_rejects_references(name, reference, message, network):
         QUICK[name](network("gap").float(), filled(0.5), reference=reference)
 
 
-class Returns(nn.Module):
-    def __init__(self, make) -> None:
-        super().__init__()
-        self.make = make
-
-    def forward(self, images):
-        return self.make(images)
-
-
 BAD_MODELS = [
     (lambda x: x.mean(dim=(2, 3)), r"output has shape \(2, 3\) for 2 image\(s\), not one number an image; end it"),
     (lambda x: x.mean(), r"output has shape \(\) for 2 image\(s\), not one number an image"),
@@ -271,7 +245,7 @@ BAD_MODELS = [
 @pytest.mark.parametrize(("make", "message"), BAD_MODELS)
 def test_rejects_models(name, make, message):
     with pytest.raises(ModelError, match=message):
-        QUICK[name](Returns(make), filled(0.5))
+        QUICK[name](Returning(make), filled(0.5))
 
 
 @pytest.mark.parametrize(
@@ -287,13 +261,7 @@ def test_impossible_options_are_refused(make, options, message):
         make(**options)
 
 
-class WithoutGradient(nn.Module):
-    @torch.no_grad()
-    def forward(self, images):
-        return images.mean(dim=(1, 2, 3))
-
-
 @pytest.mark.parametrize("name", ["integrated-gradients", "expected-gradients", "smooth-grad", "shapley"])
 def test_a_model_without_gradients_is_refused_with_its_cure(name):
     with pytest.raises(ModelError, match="has no gradient; take torch"):
-        QUICK[name](WithoutGradient(), filled(0.5))
+        QUICK[name](Returning(torch.no_grad()(lambda images: images.mean(dim=(1, 2, 3)))), filled(0.5))

@@ -123,23 +123,7 @@ def test_the_batch_size_changes_nothing(images: torch.Tensor, weights: torch.Ten
             np.testing.assert_allclose(curves(fill, size), curves(fill, 1), atol=tolerance)
 
 
-def test_a_network_that_answers_always_alike_moves_by_nothing(images: torch.Tensor, rng):
-    orders = np.stack([[removal.random_unit_order(PIXELS, rng=rng)] * IMAGES])
-    answers = removal.removal_curves(
-        lambda batch: torch.full((len(batch),), 0.3), images, orders, fill=get_fill("grey")
-    )
-    assert np.all(answers == answers[..., :1])
-
-
 MAPS = arrays(np.float64, (6, 9), elements=st.floats(-1, 1))
-
-
-def test_tiles_cover_the_image_and_may_be_smaller_at_its_border():
-    units = tile_regions((5, 7), tile_px=3).numpy()
-    assert units.tolist()[0] == [0, 0, 0, 1, 1, 1, 2]
-    assert units.tolist()[4] == [3, 3, 3, 4, 4, 4, 5]
-    with pytest.raises(InputError, match="tiles of 0 pixels are impossible"):
-        tile_regions((5, 7), tile_px=0).numpy()
 
 
 def test_a_pixel_belongs_to_the_nearest_marker_or_to_none():
@@ -149,8 +133,6 @@ def test_a_pixel_belongs_to_the_nearest_marker_or_to_none():
         for column in range(9):
             distance = np.hypot(centres[:, 0] - column, centres[:, 1] - row)
             assert units[row, column] == (distance.argmin() if distance.min() <= 2 else 2)
-    with pytest.raises(InputError, match="two or more, and there are 0; choose tiles"):
-        marker_regions((6, 9), torch.empty(0, 2), radius_px=2.0)
 
 
 @given(MAPS, st.integers(1, 5), st.booleans())
@@ -163,12 +145,6 @@ def test_units_go_whole_and_in_the_order_of_their_means(values: np.ndarray, size
     means = removal.unit_means(values, units)[gone]
     steps = np.diff(means)
     assert np.all(steps >= 0) if least_first else np.all(steps <= 0)
-
-
-@given(MAPS)
-def test_single_pixels_go_by_their_value(values: np.ndarray):
-    order = removal.unit_order(values, tile_regions(values.shape, tile_px=1).numpy())
-    np.testing.assert_array_equal(values.ravel()[order], np.sort(values.ravel())[::-1])
 
 
 def test_a_random_order_takes_units_whole_and_any_of_them_first(rng: np.random.Generator):

@@ -10,6 +10,8 @@ import torch
 from captum import attr
 from hypothesis import given
 from hypothesis import strategies as st
+from small import network_of
+from there import there
 from torch import Tensor, nn
 
 import sliplens
@@ -18,7 +20,6 @@ from sliplens.explainers.table import get_explainer
 from sliplens.faithfulness import scoring
 from sliplens.faithfulness.removal import AREAS
 from sliplens.models import Network
-from sliplens.models.checkpoint import Manifest
 from sliplens.results.study import Setting
 
 SIZE = 10
@@ -39,10 +40,7 @@ class Linear(nn.Module):
 
 @pytest.fixture
 def run() -> Network:
-    manifest = Manifest(
-        backbone="linear", input="amplitude", image_size=SIZE, frame_size=(SIZE, SIZE), sensor="", data_hash=""
-    )
-    return Network(model=Linear().eval(), manifest=manifest)
+    return network_of(Linear(), input="amplitude", image_size=SIZE)
 
 
 EFFECTS = SLOPES.numpy() * FRAMES.astype(np.float64).mean(axis=-1) / 255
@@ -64,8 +62,7 @@ def test_the_gain_of_the_true_effects_is_their_ordered_sum(run):
     score = faithfulness.score("maps")
     assert score.srg.estimate == pytest.approx(curve.symmetric_gain.mean())
     assert all(score.srg.estimate > other.srg.estimate for other in faithfulness.scores if other.control)
-    assert score.lead_over_controls is not None
-    assert score.lead_over_controls.gap.estimate > 0
+    assert there(score.lead_over_controls).gap.estimate > 0
     assert not any("gains" in alarm for alarm in faithfulness.alarms)
     assert faithfulness.to_arrow().num_rows == len(faithfulness.scores) * 3 * len(AREAS)
 
@@ -96,8 +93,7 @@ def test_several_methods_are_scored_together_and_as_each_alone(run):
     scored = sliplens.score(run, both, random_orders=1, steps=5)
     assert {score.method for score in scored.scores if not score.control} == set(both.methods)
     assert [(gap.first, gap.second) for gap in scored.comparisons] == [("occlusion", "integrated-gradients")]
-    assert scored.deletion is not None
-    assert set(scored.deletion.methods) == {*both.methods, "random"}
+    assert set(there(scored.deletion).methods) == {*both.methods, "random"}
 
 
 def test_a_map_the_wrong_way_round_loses_to_every_control(run):
@@ -106,8 +102,7 @@ def test_a_map_the_wrong_way_round_loses_to_every_control(run):
 
 
 def test_deletion_removes_the_most_salient_first_and_a_random_order_beside(run):
-    scores = sliplens.score(run, FRAMES, EFFECTS, random_orders=1, steps=5).deletion_scores
-    assert scores is not None
+    scores = there(sliplens.score(run, FRAMES, EFFECTS, random_orders=1, steps=5).deletion_scores)
     base = 0.9 + EFFECTS.sum(axis=(1, 2))
     curve = scores.curves["maps"]
     # grey replaces what a pixel was by a half
@@ -201,7 +196,7 @@ def test_an_array_of_captum_and_our_explanation_score_alike(curved: Network, cap
         if score.control:
             assert score.srg.estimate == by_record.score(score.method).srg.estimate
     if by_array.deletion is not None:
-        first, second = (by.deletion_scores.curves for by in (by_array, by_record) if by.deletion_scores is not None)
+        first, second = (there(by.deletion_scores).curves for by in (by_array, by_record))
         np.testing.assert_allclose(first["maps"].predictions, second["integrated-gradients"].predictions, atol=1e-3)
 
 
@@ -281,10 +276,6 @@ def test_a_control_that_wins_is_told():
     assert scoring.ranking_alarms({GREY: {"poly-cam": 0.4, control: 0.3}}) == []
 
 
-def mean_of_pixels(images: torch.Tensor) -> torch.Tensor:
-    return images.mean(dim=(1, 2, 3))
-
-
 @given(st.floats(0, 1), st.floats(0, 1))
 def test_deletion_score_is_symmetric_and_one_where_nothing_changed(base: float, masked: float):
     one, other = np.array([base]), np.array([masked])
@@ -319,14 +310,3 @@ def test_so_many_pixels_of_an_order_are_gone(rng: np.random.Generator):
             row, column = divmod(flat, 5)
             expected = torch.zeros(3) if flat in order[:step] else images[0, :, row, column]
             assert torch.equal(image[:, row, column], expected)
-
-
-def test_curves_of_a_network_that_averages_pixels_have_a_closed_form(rng: np.random.Generator):
-    # image of ones filled with black: the answer falls from 1 to 0 in a straight line whatever the order
-    images = torch.ones(2, 3, 8, 8)
-    orders = np.stack([rng.permutation(64) for _ in range(2)])
-    curves = scoring.delete_pixels(mean_of_pixels, images, orders, fill="black")
-    expected = 1 - np.arange(1, 9) / 8
-    # means of 192 float32 numbers
-    np.testing.assert_allclose(curves[:, 1:], np.stack([expected, expected]), atol=1e-6)
-    np.testing.assert_allclose(curves[:, 0], 1, atol=1e-6)

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from sliplens.models import Manifest, build_model, save_checkpoint
+from sliplens.models import Manifest, Network, build_model, save_checkpoint
 from sliplens.models.calibration import Calibration, Traction
 from sliplens.models.encodings import ENCODINGS
 from sliplens.recordings import ContactState, Recording
@@ -18,6 +18,26 @@ CALIBRATION = Calibration(temperature=1.0, offsets={"0.68": 0.02, "0.9": 0.05}, 
 TRACTION = Traction(
     calibration=CALIBRATION, known_friction=CALIBRATION, friction=tuple(0.15 + 0.105 * part for part in range(11))
 )
+
+
+class Returning(nn.Module):
+    """Module that returns something made of the outputs of another, or of the images themselves."""
+
+    def __init__(self, make: Callable[[torch.Tensor], object], inner: nn.Module | None = None) -> None:
+        super().__init__()
+        self.make, self.inner = make, inner or nn.Identity()
+
+    def forward(self, images: torch.Tensor) -> object:
+        return self.make(self.inner(images))
+
+
+def network_of(model: nn.Module, *, input: str, image_size: int, frame_size: int | None = None) -> Network:
+    """A module as a network in memory; its frames are square, of the size of its images unless said otherwise."""
+    size = frame_size or image_size
+    manifest = Manifest(
+        backbone="none", input=input, image_size=image_size, frame_size=(size, size), sensor="", data_hash=""
+    )
+    return Network(model=model.eval(), manifest=manifest)
 
 
 def make_recording(trial: str, *, condition: str = "dry", day: int = 1, frames: int = 12, seed: int = 0) -> Recording:

@@ -6,13 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from small import network_of
 from torch import Tensor, nn
 
 from sliplens import __version__
 from sliplens.errors import ModelError
 from sliplens.extras import import_onnxruntime
 from sliplens.files import to_builtins
-from sliplens.models import Manifest, Network
+from sliplens.models import Network
 from sliplens.models import onnx as onnx_file
 from sliplens.models.onnx import difference, export_onnx
 
@@ -36,10 +37,7 @@ class Brightness(nn.Module):
 
 @pytest.fixture
 def least() -> Network:
-    manifest = Manifest(
-        backbone="brightness", input="raw", image_size=8, frame_size=(8, 8), sensor="none", data_hash="none"
-    )
-    return Network(model=Brightness().eval(), manifest=manifest)
+    return network_of(Brightness(), input="raw", image_size=8)
 
 
 def run(path: Path, images: Tensor) -> list[np.ndarray]:

@@ -11,6 +11,7 @@ import torch
 import torchvision
 from captum.attr import DeepLift
 from PIL import Image
+from small import Returning
 from torch import Tensor, nn
 
 import sliplens as sl
@@ -29,17 +30,6 @@ def small_module(outputs: int = 1, *, inplace: bool = False, seed: int = 0) -> n
         nn.Conv2d(3, 4, 3, padding=1), nn.ReLU(inplace=inplace), nn.Conv2d(4, 4, 3, stride=2), nn.ReLU(inplace=inplace),
         nn.Flatten(), nn.Linear(4 * 7 * 7, outputs),
     ).eval()  # fmt: skip
-
-
-class Returning(nn.Module):
-    """Module that returns something made of the outputs of another."""
-
-    def __init__(self, inner: nn.Module, make: Callable[[Tensor], object]) -> None:
-        super().__init__()
-        self.inner, self.make = inner, make
-
-    def forward(self, images: Tensor) -> object:
-        return self.make(self.inner(images))
 
 
 @pytest.fixture
@@ -67,7 +57,7 @@ def images_of(frames: np.ndarray) -> Tensor:
 )
 def test_one_of_several_outputs_is_predicted(frames: np.ndarray, make: Callable, output: Output | None):
     module = small_module(3)
-    network = sl.wrap(Returning(module, make), size=SIZE, output=output)
+    network = sl.wrap(Returning(make, module), size=SIZE, output=output)
     with torch.no_grad():
         expected = module(images_of(frames))[:, 1]
     table = sl.predict(network, frames).to_arrow()
@@ -97,7 +87,7 @@ def test_every_method_explains_and_adds_up(frames: np.ndarray, change: Callable)
 
 def test_the_unit_of_the_output_does_not_change_the_verdict(frames: np.ndarray):
     module = small_module()
-    scaled = Returning(module, lambda values: 1000 * values)
+    scaled = Returning(lambda values: 1000 * values, module)
     results = []
     for each in (module, scaled):
         network = sl.wrap(each, size=SIZE, unit="N")
@@ -156,12 +146,12 @@ def test_a_module_goes_in_without_wrapping():
         (nn.Sequential(small_module(), nn.BatchNorm1d(1)).train(), {}, r"module\.eval\(\)"),
         (nn.Sequential(small_module(), nn.Dropout()).train(), {}, r"module\.eval\(\)"),
         (small_module(3), {}, "output=0"),
-        (Returning(small_module(2), lambda values: (values[:, 0], values[:, 1])), {}, "output=0"),
-        (Returning(small_module(), str), {}, "output="),
+        (Returning(lambda values: (values[:, 0], values[:, 1]), small_module(2)), {}, "output=0"),
+        (Returning(str, small_module()), {}, "output="),
         (small_module(), {"size": 32}, "size="),
         (small_module(2), {"output": 5}, "size=|output="),
         (small_module(), {"encoding": "rgbd"}, "rgb"),
-        (Returning(small_module(2), lambda values: {"fx": values}), {"output": "fy"}, r"KeyError: 'fy'.*output="),
+        (Returning(lambda values: {"fx": values}, small_module(2)), {"output": "fy"}, r"KeyError: 'fy'.*output="),
     ],
 )
 def test_what_cannot_be_wrapped_is_refused_with_its_cure(module: nn.Module, options: dict, cure: str):

@@ -9,6 +9,8 @@ import pytest
 import torch
 from scipy.stats import pearsonr
 from simulated_data import simulate_recipe
+from small import network_of
+from there import there
 from torch import Tensor, nn
 
 from sliplens.codec import load_result, save_result
@@ -17,7 +19,7 @@ from sliplens.explainers.explain import explain_frames, join_maps, network_input
 from sliplens.explainers.frames import FrameSelection, frames_from_dataset
 from sliplens.faithfulness.controls import control_maps
 from sliplens.faithfulness.removal import SHARES, unit_means
-from sliplens.models import Manifest, Network
+from sliplens.models import Network
 from sliplens.recordings import Dataset
 from sliplens.results.explanation import Explanation, MethodNotes
 from sliplens.results.study import Truth
@@ -80,17 +82,8 @@ def trained() -> Network:
 
 
 def run_of(model: nn.Module, *, input: str = "amplitude") -> Network:
-    manifest = Manifest(
-        backbone="none",
-        # the size of the difference to the untouched sensor, as it is
-        input=input,
-        image_size=SIZE,
-        frame_size=(224, 224),
-        sensor="chromatouch",
-        data_hash="none",
-        weights_sha256="of these weights",
-    )
-    return Network(model=model.eval(), manifest=manifest)
+    """A network that reads the size of the difference to the untouched sensor, as it is."""
+    return network_of(model, input=input, image_size=SIZE, frame_size=224)
 
 
 @pytest.fixture(scope="module")
@@ -222,11 +215,9 @@ def test_an_additive_network_agrees_with_the_stick_game_from_the_neutral_frame(t
         x, y = np.round(frame.now_px).astype(int).T
         values[y, x] = towards * record.stick
     truth = judge(trained, stuck, data, maps={"points": points, "flat": 0 * points}, pairs=PAIRS).join(records)
-    points, flat = (truth.methods[name].neutral for name in ("points", "flat"))
-    assert points is not None
-    assert flat is not None
-    assert points.estimate > 0.99
-    assert flat.estimate == 0
+    points, flat = (there(truth.methods[name].neutral).estimate for name in ("points", "flat"))
+    assert points > 0.99
+    assert flat == 0
     np.testing.assert_array_equal(truth.effects.stick, np.concatenate([record.stick for record in records]))
 
 
@@ -285,10 +276,9 @@ def test_the_meta_test_tells_fills_apart(judged):
     meta = {test.fill: test for test in judged.meta}
     assert set(meta) == {"reference", "grey", "true"}
     for test in meta.values():
-        assert test.gap is not None
-        assert test.gap.estimate == pytest.approx(test.oracle - test.degraded)
+        assert there(test.gap).estimate == pytest.approx(test.oracle - test.degraded)
         # of a single trial nothing is sure
-        assert (test.gap.low, test.holds) == (None, False)
+        assert (there(test.gap).low, test.holds) == (None, False)
     # each marker of this network counts for itself and all one way: the oracle's order is the best there is
     assert meta["true"].gap.estimate > 0
     assert meta["true"].oracle >= meta["true"].changed
@@ -307,8 +297,7 @@ def test_a_gain_is_put_to_the_test_by_several_trials_or_not_at_all(trials, holds
     ]  # fmt: skip
     clusters = np.stack([np.zeros(3 * trials), np.arange(3 * trials) % trials])
     (test,) = meta_test(effects, partial(mean_of_defined, clusters=clusters, seed=0))
-    assert test.gap is not None
-    assert test.gap.estimate == pytest.approx(0.2, abs=0.03)
+    assert there(test.gap).estimate == pytest.approx(0.2, abs=0.03)
     assert test.holds == holds
 
 
