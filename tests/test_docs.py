@@ -224,7 +224,9 @@ def desk(workshop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hurry:
     return Path.cwd()
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if page.suffix == ".md" and code_of(page)], ids=lambda page: page.stem)
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if page.suffix == ".md" and code_of(page)], ids=lambda page: page.stem
+)
 def test_the_python_of_a_page_runs_from_top_to_bottom(page: Path, desk: Path):
     """Blocks of the README are pasted one at a time."""
     names: dict[str, Any] = {}

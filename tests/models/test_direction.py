@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pulled import pulled_frames
+from scripted import source_of
 
 import sliplens as sl
-from sliplens.live import LiveFrame
-from sliplens.live.frame_reader import FrameReader
+from sliplens.live.health import HealthMonitor
 from sliplens.live.reading import Reading
-from sliplens.live.sources import open_live
-from sliplens.models import Network, make_engine
+from sliplens.models import Network
 from sliplens.shear import FULL_CIRCLE
 
 TURNS = {
@@ -42,12 +41,7 @@ def turned_frames(direction_deg: float, turn: str, *, margins: tuple[float, ...]
 
 def read_live(network: Network, reference: np.ndarray, frames: np.ndarray) -> list[Reading]:
     """Read frames as a running sensor's, none of them dropped."""
-    reader = FrameReader(open_live(frames), network, slip=None)
-    reader.begin(make_engine("torch", network, batch_size=1), reference)
-    return [
-        reader.read(LiveFrame(image=image, number=at, time_s=at / 30, captured_s=0.0))
-        for at, image in enumerate(frames)
-    ]
+    return source_of(frames).all_readings(network, reference=reference, health=HealthMonitor)
 
 
 def withheld_by(network: Network, reference: np.ndarray, frames: np.ndarray, *, live: bool) -> list[bool]:

@@ -148,15 +148,9 @@ def _options(kind: Any, command: Command, *, skip: int = 0, group: str = "") -> 
 def _parameter_help(kind: Any) -> dict[str, str]:
     """Return the description of each parameter or field, as one paragraph."""
     helps = {}
-    if inspect.isclass(kind):
-        for base in getattr(kind, "__orig_bases__", kind.__bases__):
-            helps |= _parameter_help(base) if getattr(base, "__module__", "").startswith("sliplens.") else {}
-        # descriptions of fields stand below them, in the source only
-        for pair in pairwise(ast.walk(ast.parse(inspect.getsource(kind)))):
-            match pair:
-                case ast.AnnAssign(target=ast.Name(field)), ast.Expr(ast.Constant(str(text))):
-                    helps[field] = text
-    for param in docstring_parser.parse(kind.__doc__ or "").params:
+    for base in getattr(kind, "__orig_bases__", getattr(kind, "__bases__", ())):
+        helps |= _parameter_help(base) if getattr(base, "__module__", "").startswith("sliplens.") else {}
+    for param in docstring_parser.parse_from_object(kind).params:
         helps |= dict.fromkeys(param.arg_name.replace(" ", "").split(","), param.description or "")
     return {name: " ".join(text.split()) for name, text in helps.items()}
 

@@ -514,7 +514,7 @@ def call_hold(call: Any, source: str, **options: Unpack[HoldOptions]) -> None:
     from sliplens.grip.source import open_grip, usual_network
     from sliplens.live import LiveReader
     from sliplens.live.contract import LiveOptions
-    from sliplens.live.frame_reader import ReaderSettings
+    from sliplens.live.loop import ReaderSettings
 
     arguments = call.keywords
     gripper = arguments["gripper"]

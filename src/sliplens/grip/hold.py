@@ -194,7 +194,7 @@ class HoldLoop:
                 pace.wait(number * PERIOD_S)
                 ends = [reader.ended for reader in self._readers]
                 if None not in ends:
-                    failed = any(reader.failed for reader in self._readers)
+                    failed = any(reader.error is not None for reader in self._readers)
                     return "failed" if failed else "source", ", ".join(map(str, ends))
                 if seconds is not None and time.monotonic() - begun_s >= seconds:
                     break
@@ -267,11 +267,10 @@ def _require_fit(controller: Controller, readers: Sequence[LiveReader]) -> None:
     """Refuse readers that cannot hold together, and a controller that needs more than they provide."""
     if len(readers) not in {1, 2}:
         raise InputError(f"a gripper has one or two fingertips that are read, got {len(readers)}")
-    if not all(reader.entered for reader in readers):
-        raise InputError("nothing is read yet; enter the reader first, with `with reader:`")
     if isinstance(controller, AssumedFriction):
         raise InputError("this controller needs a force sensor at the wrist; choose margin, reflex or fixed")
     for reader in readers:
+        reader.require_entered()
         name = reader.source.name
         if isinstance(controller, Oracle):
             if not reader.source.simulated:

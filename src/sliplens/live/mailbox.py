@@ -1,7 +1,7 @@
 """Hand-over between threads: a mailbox for the newest items, and an outlet that works them off."""
 
-from abc import abstractmethod
 from collections import deque
+from collections.abc import Callable
 from threading import Condition, Thread
 from typing import Generic, TypeVar
 
@@ -53,6 +53,8 @@ class Outlet(Mailbox[Item]):
     ----------
     name
         Folder of the recording, or name of the sink.
+    send, end
+        Called with each item, and once no more is sent; after an exception of `send` nothing more is.
     most_bytes
         Size of the items that may wait; of more, the oldest is lost.
     """
@@ -61,9 +63,9 @@ class Outlet(Mailbox[Item]):
     """Action with an item, in messages."""
     cure = "start it again"
 
-    def __init__(self, name: str, *, most_bytes: int) -> None:
+    def __init__(self, name: str, *, send: Callable[[Item], None], end: Callable[[], None], most_bytes: int) -> None:
         super().__init__(most_bytes=most_bytes)
-        self.name, self.sent = name, 0
+        self._send, self._end, self.name, self.sent = send, end, name, 0
         """Number of frames that are on disk, or of readings that the sink took."""
         self.error: Exception | None = None
         """Exception that ended it before it was closed."""
@@ -73,14 +75,6 @@ class Outlet(Mailbox[Item]):
     def __str__(self) -> str:
         lost = f", {self.lost:,} lost" if self.lost else ""
         return f"{self.name}: {self.sent:,} {self.verb}{lost}{f'; {self.trouble}' if self.trouble else ''}"
-
-    @abstractmethod
-    def _send(self, item: Item) -> None:
-        """Hand on an item; after an exception nothing more is sent."""
-
-    @abstractmethod
-    def _end(self) -> None:
-        """End, once no more is sent."""
 
     @property
     def trouble(self) -> str | None:

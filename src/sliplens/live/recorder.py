@@ -73,7 +73,7 @@ class Recorder(Outlet[tuple[LiveFrame, Frame | None]]):
         self._last: LiveFrame | None = None
         self._first_s = 0.0
         self._reference: Frame | None = None
-        super().__init__(str(folder), most_bytes=_MOST_WAITING_BYTES)
+        super().__init__(str(folder), send=self._write, end=self._end_trial, most_bytes=_MOST_WAITING_BYTES)
 
     def add(self, frame: LiveFrame, reference: Frame | None = None) -> None:
         """Take a frame, and the sensor untouched; another thread writes it, or loses it where that is far behind."""
@@ -101,7 +101,7 @@ class Recorder(Outlet[tuple[LiveFrame, Frame | None]]):
         self._finish()
         return load_dataset(self.folder) if self.sent else None
 
-    def _send(self, item: tuple[LiveFrame, Frame | None]) -> None:
+    def _write(self, item: tuple[LiveFrame, Frame | None]) -> None:
         (frame, reference), last = item, self._last
         goes_on = last is not None and frame.size == last.size and frame.time_s > last.time_s
         is_same = reference is self._reference or np.array_equal(np.asarray(reference), np.asarray(self._reference))
@@ -114,12 +114,12 @@ class Recorder(Outlet[tuple[LiveFrame, Frame | None]]):
         self._journal.append(frame.image, time_s=frame.time_s - first_s, safety_margin=margin, forces=forces)
         self._last = frame
 
-    def _end(self) -> None:
+    def _end_trial(self) -> None:
         if self._journal is not None:
             self._journal.close()
 
     def _begin_trial(self, frame: LiveFrame, reference: Frame | None) -> None:
-        self._end()
+        self._end_trial()
         names = (f"{self._facts.trial}-{number}" for number in itertools.count(1))
         facts = replace(self._facts, trial=next(name for name in names if name not in self._taken))
         forces = None if frame.forces is None else frame.forces.source
@@ -197,9 +197,7 @@ class ForceStream:
                 for line in lines:
                     arrived_s, fields = time.monotonic(), line.split(separator)
                     if len(fields) < len(names):
-                        counts = f"{len(fields)} columns, {len(names)} are named"
-                        self.trouble = f"{path} has a line of {counts}; the forces of {path} end here"
-                        return
+                        raise RecordingError(f"{path} has a line of {len(fields)} columns, {len(names)} are named")
                     values = [float(fields[at]) * scale for at, scale in columns]
                     force_n, stamp_s = values[: len(forces)], values[-1] if times else np.nan
                     if len(force_n) == 2:  # normal and tangential, as `import` lays them along z and x

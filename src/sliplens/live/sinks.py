@@ -361,14 +361,8 @@ class Sender(Outlet[tuple[Reading, Frame | None]]):
     """Outlet of readings to a sink, by its name: a slow one loses readings, and delays none."""
 
     def __init__(self, name: str) -> None:
-        self._sink = open_sink(name)
-        super().__init__(name, most_bytes=_MOST_WAITING_BYTES)
-
-    def _send(self, item: tuple[Reading, Frame | None]) -> None:
-        self._sink.send(*item)
-
-    def _end(self) -> None:
-        self._sink.close()
+        sink = open_sink(name)
+        super().__init__(name, send=lambda item: sink.send(*item), end=sink.close, most_bytes=_MOST_WAITING_BYTES)
 
     def add(self, reading: Reading, frame: LiveFrame | None) -> None:
         """Take a reading and its frame, without waiting."""
