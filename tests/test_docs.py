@@ -65,7 +65,7 @@ def blocks_of(page: Path) -> list[Block]:
     text = page.read_text(encoding="utf-8")
     if page.suffix == ".py":
         return [Block("python", "", text, 1)]
-    return [Block(*found.groups(), text.count("\n", 0, found.start(3))) for found in _CODE.finditer(text)]
+    return [Block(found[1], found[2], found[3], text.count("\n", 0, found.start(3))) for found in _CODE.finditer(text)]
 
 
 def code_of(page: Path) -> list[ast.Module]:

@@ -25,7 +25,7 @@ CAMS = ["grad-cam", "poly-cam"]
 HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
 
 
-def state_of(model: nn.Module):
+def state_of(model: torch.nn.Module):
     """Everything that a call must leave alone."""
     return {
         "tensors": {name: value.clone() for name, value in model.state_dict().items()},

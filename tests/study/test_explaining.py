@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -144,7 +145,7 @@ def test_a_strip_is_explanation_by_the_recommended_method_of_tiles_where_no_mark
 def test_explain_takes_the_facts_that_predict_takes(network: Network, small_dataset: Dataset, tmp_path: Path):
     recording = small_dataset.load(small_dataset.trials[-1])
     video = write_video(recording, tmp_path / "cup.mkv")
-    options = {"method": "grad-cam"}
+    options: dict[str, Any] = {"method": "grad-cam"}
     chosen = explain(network, small_dataset, trial=recording.trial, select=FrameSelection(levels=(0.0,)), **options)
     assert list(chosen.trials) == [recording.trial]
     whole = explain(network, recording, **options)  # with its labels, which name the stick frame
