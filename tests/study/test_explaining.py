@@ -154,6 +154,7 @@ def test_explain_takes_the_facts_that_predict_takes(network: Network, small_data
     np.testing.assert_allclose(whole.relevance["grad-cam"][row], chosen.relevance["grad-cam"][0], atol=1e-6)
     # an untouched frame is taken for the reference, as by `predict`
     shown = replace(network, manifest=replace(network.manifest, input="signed"))
+    facts: dict[str, Any] = {}
     for source, facts in ((video, {}), (str(video), {"format": "video", "options": ReadOptions(frame_rate=25.0)})):
         assumed = explain(shown, source, baseline="untouched", **options, **facts)
         assert "first frame was taken for the untouched sensor" in " ".join(assumed.methods["grad-cam"].warnings)

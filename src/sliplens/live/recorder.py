@@ -197,7 +197,8 @@ class ForceStream:
                 for line in lines:
                     arrived_s, fields = time.monotonic(), line.split(separator)
                     if len(fields) < len(names):
-                        raise RecordingError(f"{path} has a line of {len(fields)} columns, {len(names)} are named")
+                        counts = f"{len(fields)} columns, {len(names)} are named"
+                        raise RecordingError(f"{path} has a line of {counts}")  # noqa: TRY301 (reported below)
                     values = [float(fields[at]) * scale for at, scale in columns]
                     force_n, stamp_s = values[: len(forces)], values[-1] if times else np.nan
                     if len(force_n) == 2:  # normal and tangential, as `import` lays them along z and x
