@@ -1,6 +1,7 @@
 """What is exported is documented: in words, with units and shapes, and on the page of the Python interface."""
 
 import ast
+import doctest
 import importlib.util
 import inspect
 import pkgutil
@@ -131,13 +132,16 @@ def test_a_number_has_a_unit_and_an_array_a_shape(module, name, thing):
     assert not lacking
 
 
-@pytest.mark.parametrize("name", [name for name in sliplens.__all__ if inspect.isfunction(getattr(sliplens, name))])
-def test_a_call_has_an_example_and_names_its_neighbours(name):
+CALLS = [name for name in sliplens.__all__ if inspect.isfunction(getattr(sliplens, name))]
+
+
+@pytest.mark.parametrize("name", [*CALLS, "Friction", "LiveReader", "StudyConfig"])
+def test_a_call_has_an_example_with_its_output_and_names_its_neighbours(name):
     doc = inspect.getdoc(getattr(sliplens, name)) or ""
     neighbours = re.findall(r"^(\w+) : ", doc.partition("See Also\n--------\n")[2].partition("\n\n")[0], re.MULTILINE)
     assert neighbours
     assert set(neighbours) <= set(sliplens.__all__) - {name}
-    assert ">>> " in doc
+    assert any(example.want for example in doctest.DocTestParser().get_examples(doc))
 
 
 def test_the_rule_of_units_and_shapes_can_fail():
@@ -161,9 +165,9 @@ def test_the_pages_of_the_interface_describe_every_name_of_the_package():
     listed = re.findall(r"^\| \{py:\w+\}`~sliplens\.(\w+)`", API_PAGE, flags=re.MULTILINE)
     modules = {module.__name__.removeprefix("sliplens.") for module in MODULES}
     assert sorted(set(described) - modules) == sorted(listed) == sorted(set(sliplens.__all__) - {"__version__"})
-
-
-CALLS = [name for name in sliplens.__all__ if inspect.isfunction(getattr(sliplens, name))]
+    # call, command, result, purpose, and the equation or algorithm, in words or by a link
+    rows = re.findall(r"^\| \{py:\w+\}.*$", API_PAGE, flags=re.MULTILINE)
+    assert all(row.count(" | ") == 4 and not row.endswith("|  |") for row in rows)
 
 
 @pytest.mark.parametrize("name", [*CALLS, "LiveReader", "StudyConfig"])

@@ -43,9 +43,8 @@ def run_demo(
     """Simulate a few grips, predict and explain them, and write a page of the results.
 
     The page is written as soon as the first grip is explained, and again after each further stage. It says whether
-    such maps can be trusted, by the study that comes with the package, and proves one of them: the simulator moves the
-    markers that it ranks first. It explains real frames too, where the public ChromaTouch images are in the folder that
-    `SLIPLENS_REFERENCE` names. After an interruption the same call continues.
+    such maps can be trusted, by the study of the package, and tests one: the simulator moves the markers ranked first.
+    Real frames follow if `SLIPLENS_REFERENCE` names the folder of the public images. An interrupted call continues.
 
     Parameters
     ----------

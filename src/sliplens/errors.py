@@ -1,4 +1,4 @@
-"""The exceptions sliplens raises for mistakes a user can fix; each message is one sentence with the cure."""
+"""The exceptions sliplens raises for mistakes a user can correct; each message is one sentence with the cure."""
 
 from collections.abc import Mapping
 
@@ -6,10 +6,7 @@ _LONGEST = 1500
 
 
 class SliplensError(Exception):
-    """Base of every error that the user can fix; the command line prints it and exits with code 2.
-
-    It stays a sentence whatever a file holds: of what is longer than that the middle is left out.
-    """
+    """Base class of all user errors: one sentence with the cure, which the command line prints (exit code 2)."""
 
     def __str__(self) -> str:
         text = super().__str__()

@@ -659,8 +659,7 @@ def read_live(
 ) -> Iterator[Reading]:
     """Iterate over the readings of a running sensor; a slow caller gets the newest.
 
-    Parameters are those of `LiveReader`, which also takes a new reference while it runs, and calls back with every
-    reading.
+    Parameters are those of `LiveReader`.
 
     Raises
     ------

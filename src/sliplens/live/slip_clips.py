@@ -76,7 +76,8 @@ def evaluate_slip(table: Path | str, *, after: int | None = None, markers: str =
     Examples
     --------
     >>> import sliplens as sl
-    >>> scores = sl.evaluate_slip("lifts.csv", after=10).scores  # doctest: +SKIP
+    >>> sl.evaluate_slip("lifts.csv", after=10).scores.balanced_accuracy[0].round(2)  # doctest: +SKIP
+    0.81
     """
     text = open_text_table(path := Path(table))
     label = next((name for name in _LABELS if name in text.header), "slips")

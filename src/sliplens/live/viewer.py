@@ -86,7 +86,8 @@ def view(
     Examples
     --------
     >>> import sliplens as sl
-    >>> sl.view("data", out="trial.rrd")  # doctest: +SKIP
+    >>> sl.view("data", out="trial.rrd").frames  # doctest: +SKIP
+    240
     """
     require_keywords(view, source_options)
     path = None if out is None else Path(out)

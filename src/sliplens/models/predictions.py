@@ -171,7 +171,7 @@ def predict(
         Device of a network that is loaded here: cpu or cuda.
     out
         File to write, Parquet or CSV by its ending; without an ending a folder, a Parquet data set with a file a
-        trial. Whole or not at all, and interrupted it goes on after its last trial; rows are kept in memory if None.
+        trial. It appears when complete; an interrupted call continues. Rows stay in memory if None.
     overwrite
         If True, replace a file or folder `out`.
     on_progress

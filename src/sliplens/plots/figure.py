@@ -35,8 +35,7 @@ def plot(result: Any, ax: Axes | None = None, *, index: int | None = None) -> Fi
     An evaluation shows predictions against labels; a training or a network its learning curve; an explanation the map
     over the image, with its warnings; scores of explanations their curves or gains; predictions the margin over time;
     tracked markers their displacement; a study the gain of each method with its 95 % interval; a grip the force over
-    the least that holds; a hold the commanded force; any other result the first number of its table. Margins are in
-    percent, gains in margin units.
+    the least that holds; a hold the commanded force. Margins are in percent, gains in margin units.
 
     Parameters
     ----------

@@ -80,8 +80,11 @@ def draft_corrections(data: Dataset | Path | str, path: Path | str) -> None:
     Examples
     --------
     >>> import sliplens as sl
-    >>> sl.draft_corrections("data", "corrections.csv")  # doctest: +SKIP
-    >>> sl.label_dataset("data", corrections="corrections.csv")  # doctest: +SKIP
+    >>> data = sl.simulate(dry_trials=3, wet_trials=0, days=2, frames_per_trial=20)
+    >>> table = data.folder / "corrections.csv"
+    >>> sl.draft_corrections(data, table)
+    >>> table.read_text().splitlines()[0].split(",")[:4]
+    ['trial', 'exclude', 'reference_frame', 'normal_sign']
     """
     data, path = load_dataset(data), Path(path)
     if path.exists():
@@ -145,6 +148,8 @@ def label_dataset(
     >>> import sliplens as sl
     >>> from sliplens.recordings import LabelSettings
     >>> data = sl.label_dataset("data", out="other", labelling=LabelSettings(mu=0.8))  # doctest: +SKIP
+    >>> data.read_labels(data.trials[0]).safety_margin[-1].round(2)  # doctest: +SKIP
+    0.36
     """
     with reporting(on_progress):
         data = load_dataset(data)

@@ -39,8 +39,7 @@ def write_report(
 ) -> Written:
     """Write the report of a workspace as one self-contained HTML file, and figures of the thesis beside it.
 
-    Each of these is written as `figures/NAME.pdf`, and its numbers as `figures/NAME.csv`; other files there are left as
-    they are.
+    Each is written as `figures/NAME.pdf`, and its numbers as `figures/NAME.csv`; other files there stay.
 
     Parameters
     ----------

@@ -52,7 +52,7 @@ def run_study(
     overwrite: bool = False,
     on_progress: OnProgress | None = None,
 ) -> Study:
-    """Find out which explanation of a network can be believed: the experiment of the thesis, and controls it lacks.
+    """Test which explanation of a network can be trusted: the experiment of the thesis, and controls it lacks.
 
     Evaluates the networks on the test trials, chooses trials on which they predict well, explains frames from full
     stick to full slip, scores the explanations by removal under several fills against controls, and, where the data are
