@@ -161,6 +161,10 @@ def main() -> None:
     parser.add_argument("--kept", action="store_true", help="try what was built before")
     kept = parser.parse_args().kept
     seconds, warnings = (0.0, 0) if kept else build()
+    sys.path.append(str(DOCS.parent / "benchmarks"))
+    from house import measure  # noqa: PLC0415 (a script beside the package)
+
+    counts = measure()
     pages = [path for path in sorted(SITE.rglob("*.html")) if not {"_modules", "_static"} & set(path.parts)]
     gallery = [path for path in pages if path.parent.name == "gallery" and path.name.startswith("plot_")]
     if not (SITE / "gallery.xml").is_file():
@@ -177,7 +181,8 @@ def main() -> None:
     for fault in faults + (seen or []):
         print(fault)
     print(
-        f"{seconds:.0f} s: {len(pages)} pages, {len(gallery)} of the gallery, {len(ran)} examples executed in "
+        f"{seconds:.0f} s: {len(pages)} pages, {counts.doc_words:,} words, {counts.words_per_sentence} a sentence, "
+        f"{len(gallery)} of the gallery, {len(ran)} examples executed in "
         f"{sum(ran.values()):.0f} s (at most {max(ran.values(), default=0):.0f} s), {warnings} warnings, "
         f"{len(faults)} faults"
         + (", not opened in a browser" if seen is None else f", {len(seen)} faults in a browser")

@@ -8,10 +8,9 @@ stale` and `frozen` half of the picture, or all of it under fresh noise, has sto
 where it errs by more than 0.2, or without contact. `shown_wrong_share` is the share of frames off and not withheld.
 
 `auroc` ranks all these frames by `margin_risk`, in which all checks and the network's own spread are one number, and
-`auroc_worst` by how far their worst check is from its limit. `auroc_true_fault` is the best that can be reached:
-ranking by the true fault and strength, and how often it put the margins of the other trials off. `seen_by_network` is
-the AUROC of each fault against frames without one, by `Estimate.known`. `withheld_healthy` is the share
-of healthy frames withheld.
+`auroc_worst` by how far their worst check is from its limit. `auroc_true_fault` is the best possible: ranking by the
+true fault and strength, and how often it put the margins of the other trials off. `seen_by_network` is the AUROC of
+each fault against frames without one, by `Estimate.known`. `withheld_healthy` is the share of healthy frames withheld.
 
 With --choose, on other days and sensors, the quantiles of healthy values are printed, from which the limits were
 chosen, and the numbers of `margin_risk`. Choice and test share no day and no sensor.

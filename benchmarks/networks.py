@@ -196,7 +196,7 @@ def r2_over_days(name: str, truth: np.ndarray, answer: np.ndarray, days: np.ndar
 
 @dataclass(frozen=True, kw_only=True)
 class Read:
-    """Predictions of a network for frames of a set, trial by trial, by the friction given to it, and the truth."""
+    """Predictions of a network for frames of a set, trial by trial, by the friction given to it; true values."""
 
     estimates: dict[str, list[Estimate]]
     margin: Float[np.ndarray, " frames"]
