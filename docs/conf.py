@@ -42,7 +42,7 @@ extensions = [
 autosummary_generate = False
 # names in backticks are names of the interface wherever they are known
 default_role = "py:obj"
-# a field may be named as a builtin is (`object`): which one is meant nobody need say
+# a field may have the name of a builtin (`object`); the warning of two targets is of no use
 suppress_warnings = ["ref.python"]
 exclude_patterns = ["_build"]
 

@@ -125,7 +125,7 @@ def score(
     Examples
     --------
     >>> import sliplens as sl
-    >>> maps = sl.explain("chromatouch-pair", frames, reference=untouched)  # doctest: +SKIP
+    >>> maps = sl.explain("chromatouch-pair", "cup.mp4", reference="untouched.png")  # doctest: +SKIP
     >>> score = sl.score("chromatouch-pair", maps).scores[0]  # doctest: +SKIP
     >>> score.method, round(score.srg.estimate, 2), score.lead_over_controls.control  # doctest: +SKIP
     ('shapley-marker', 0.81, 'change')
