@@ -3,6 +3,7 @@
 import ast
 import importlib
 import inspect
+import os
 import re
 import runpy
 import shlex
@@ -19,6 +20,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from command_line import typed
+from made_up import write_workspace
 from own_recording import write_forces, write_frames
 from simulated_data import simulate_recipe
 
@@ -28,7 +30,7 @@ from sliplens.cli.app import adapt
 from sliplens.cli.commands import COMMANDS
 from sliplens.images import write_png
 from sliplens.live import LiveReader
-from sliplens.simulation import SimulationRecipe
+from sliplens.simulation import SimulationRecipe, plan_trials, simulate_trial
 from sliplens.training.config import RECIPES
 
 ROOT = Path(__file__).parents[1]
@@ -184,21 +186,21 @@ def test_what_a_page_types_is_a_command_with_its_options(page: Path):
 def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder with the files that pages name: a data set, a network, a recording."""
     folder = tmp_path_factory.mktemp("workshop")
-    data = simulate_recipe(
-        folder / "runs/mine/data",
-        SimulationRecipe(dry_trials=5, wet_trials=1, days=3, frames_per_trial=20, release=True),
-    )
-    simulate_recipe(folder / "OTHER", SimulationRecipe(dry_trials=3, wet_trials=0, days=2, frames_per_trial=8, seed=9))
+    recipe = SimulationRecipe(dry_trials=5, wet_trials=1, days=3, frames_per_trial=40)
+    simulate_recipe(folder / "runs/mine/data", recipe)
+    simulate_recipe(folder / "OTHER", SimulationRecipe(dry_trials=3, wet_trials=0, days=2, frames_per_trial=20, seed=9))
+    write_workspace(folder / "RUNS")
     shutil.copytree(ROOT / "src/sliplens/weights/chromatouch-pair", folder / "runs/mine/train")
     for name in ("DATA", "data", "RUN", "run"):
         (folder / name).symlink_to("runs/mine/data" if name.lower() == "data" else "runs/mine/train")
-    trial = data.load(data.trials[0])
-    for name in ("cup", "tip", "grasp"):
-        write_frames(folder / f"{name}.mp4", trial.frames, codec="libx264", pixels="yuv420p", rate=30)
-        write_forces(trial, folder / f"{name}.csv")
-    write_frames(folder / "clip.avi", trial.frames, rate=30)
-    for name, image in [("untouched", trial.reference), ("UNTOUCHED", trial.reference), ("frame", trial.frames[8])]:
+    trial = simulate_trial(plan_trials(replace(recipe, frames_per_trial=120, release=True))[0])
+    times_ms = np.round(1000 * trial.time_s).astype(int).tolist()
+    for name in ("cup.mp4", "tip.mp4", "grasp.mp4", "clip.avi"):
+        write_frames(folder / name, trial.frames, codec="libx264", pixels="yuv420p", stamps_ms=times_ms)
+    write_forces(trial, folder / "cup.csv")
+    for name, image in [("untouched", trial.reference), ("UNTOUCHED", trial.reference), ("frame", trial.frames[50])]:
         write_png(folder / f"{name}.png", image)
+    (folder / "frames").mkdir()
     for number, frame in enumerate(trial.frames):
         write_png(folder / f"frames/frame-{number}.png", frame)
     return folder
@@ -219,8 +221,8 @@ def hurry(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def desk(workshop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hurry: None) -> Path:
-    """Copy of the workshop, as the folder to work in."""
-    monkeypatch.chdir(shutil.copytree(workshop, tmp_path / "desk", symlinks=True))
+    """Copy of the workshop, as the folder to work in; no file is written in place, so that links will do."""
+    monkeypatch.chdir(shutil.copytree(workshop, tmp_path / "desk", symlinks=True, copy_function=os.link))
     return Path.cwd()
 
 
@@ -243,7 +245,7 @@ def test_few_blocks_of_python_are_not_run():
     assert len(marks) <= 3
 
 
-QUICK = {"check", "recover", "predict", "track", "split", "label", "sensor new", "export onnx"}
+QUICK = {"check", "recover", "predict", "track", "sensor new", "export onnx"}
 
 
 @MARKDOWN
