@@ -30,7 +30,7 @@ from sliplens.cli.app import adapt
 from sliplens.cli.commands import COMMANDS
 from sliplens.images import write_png
 from sliplens.live import LiveReader
-from sliplens.simulation import SimulationRecipe, plan_trials, simulate_trial
+from sliplens.simulation import Nuisances, SimulationRecipe, plan_trials, simulate_trial
 from sliplens.training.config import RECIPES
 
 ROOT = Path(__file__).parents[1]
@@ -67,7 +67,7 @@ def blocks_of(page: Path) -> list[Block]:
     text = page.read_text(encoding="utf-8")
     if page.suffix == ".py":
         return [Block("python", "", text, 1)]
-    return [Block(found[1], found[2], found[3], text.count("\n", 0, found.start(3))) for found in _CODE.finditer(text)]
+    return [Block(fence[1], fence[2], fence[3], text.count("\n", 0, fence.start(3))) for fence in _CODE.finditer(text)]
 
 
 def code_of(page: Path) -> list[ast.Module]:
@@ -200,6 +200,15 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_forces(trial, folder / "cup.csv")
     for name, image in [("untouched", trial.reference), ("UNTOUCHED", trial.reference), ("frame", trial.frames[50])]:
         write_png(folder / f"{name}.png", image)
+    pulls = [
+        simulate_trial(plan_trials(replace(recipe, nuisances=Nuisances(shear_direction_deg=(turn, turn))))[0])
+        for turn in (0.0, 90.0)
+    ]
+    loads = [np.outer(pull.tangential_force_n, axis) for pull, axis in zip(pulls, np.eye(3), strict=False)]
+    force_n = np.concatenate(loads) + np.outer(np.concatenate([pull.normal_force_n for pull in pulls]), [0, 0, 1])
+    states = np.concatenate([pull.frames for pull in pulls])[force_n[:, 2] > 0]
+    known = {"force_n": force_n[force_n[:, 2] > 0], "untouched": pulls[0].reference}
+    np.savez(folder / "states.npz", frames=states, **known)
     (folder / "frames").mkdir()
     for number, frame in enumerate(trial.frames):
         write_png(folder / f"frames/frame-{number}.png", frame)
@@ -245,7 +254,7 @@ def test_few_blocks_of_python_are_not_run():
     assert len(marks) <= 3
 
 
-QUICK = {"check", "recover", "predict", "track", "sensor new", "export onnx"}
+QUICK = {"check", "recover", "predict", "track", "sensor new"}
 
 
 @MARKDOWN
