@@ -1,5 +1,7 @@
 """Mistakes on the command line: one sentence with its cure, exit code 2, and nothing written."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -137,6 +139,34 @@ def test_a_mistake_is_one_sentence_and_leaves_nothing(
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
     assert fill(message, places) in refused(capsys, *(fill(word, places) for word in words.split()))
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
+
+
+MISSING = """
+import ast, re, sys
+from sliplens.cli import main
+from sliplens.cli.commands import COMMANDS
+
+refused = 0
+for name, command in COMMANDS.items():
+    arguments = command.definition.args
+    for place, parameter in enumerate((*arguments.args, *arguments.kwonlyargs)):
+        takes_path = re.search(r"\\bPath\\b|NetworkLike", ast.unparse(parameter.annotation))
+        if parameter.arg in {"out", "sensor", "splits", "baseline", "on_page"} or not takes_path:
+            continue
+        option = f"--{parameter.arg.replace('_', '-')}"
+        forms = [[option, "nowhere/x"]] + [["."] * place + ["nowhere/x"]] * (parameter in arguments.args)
+        for words in forms:
+            assert main([*name.split(), *words]) == 2, (name, words)
+            refused += 1
+assert refused > 50
+assert "torch" not in sys.modules
+"""
+
+
+def test_a_missing_path_is_refused_by_every_command_before_torch_is_imported():
+    done = subprocess.run([sys.executable, "-c", MISSING], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert all("nowhere/x does not exist; check the path" in line for line in done.stderr.splitlines())
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,6 @@ def test_a_data_set_is_predicted(
     assert told == {
         "sliplens.version": __version__,
         "sliplens.engine": "torch",  # for so few frames
-        "sliplens.source": str(small_dataset.folder),
         "sliplens.manifest_hash": hash_json(read_json(difference_run / "manifest.json")),
         "sliplens.weights_sha256": hash_file(difference_run / "model.safetensors"),
     }

@@ -16,7 +16,9 @@ from torch import Tensor, nn
 
 import sliplens as sl
 from sliplens.errors import ModelError, SliplensError
+from sliplens.explainers import attribution
 from sliplens.explainers.table import get_explainer
+from sliplens.faithfulness import controls
 from sliplens.models.wrapping import Output
 
 SIZE = 16
@@ -71,8 +73,9 @@ def test_one_of_several_outputs_is_predicted(frames: np.ndarray, make: Callable,
         lambda _: small_module(inplace=True),
         lambda module: module.double(),
         lambda module: module.to(memory_format=torch.channels_last),
+        lambda module: torch.compile(module, backend="eager"),
     ],
-    ids=["plain", "in place", "float64", "channels last"],
+    ids=["plain", "in place", "float64", "channels last", "compiled"],
 )
 def test_every_method_explains_and_adds_up(frames: np.ndarray, change: Callable):
     network = sl.wrap(change(small_module()), size=SIZE)
@@ -149,6 +152,7 @@ def test_a_module_goes_in_without_wrapping():
         (Returning(lambda values: (values[:, 0], values[:, 1]), small_module(2)), {}, "output=0"),
         (Returning(str, small_module()), {}, "output="),
         (small_module(), {"size": 32}, "size="),
+        (small_module(), {"size": 0}, "size is 0; give"),
         (small_module(2), {"output": 5}, "size=|output="),
         (small_module(), {"encoding": "rgbd"}, "rgb"),
         (Returning(lambda values: {"fx": values}, small_module(2)), {"output": "fy"}, r"KeyError: 'fy'.*output="),
@@ -157,6 +161,70 @@ def test_a_module_goes_in_without_wrapping():
 def test_what_cannot_be_wrapped_is_refused_with_its_cure(module: nn.Module, options: dict, cure: str):
     with pytest.raises(SliplensError, match=cure):
         sl.wrap(module, **{"size": SIZE, **options})
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning", "ignore::DeprecationWarning")
+@pytest.mark.parametrize(
+    ("change", "methods", "cure"),
+    [
+        (torch.jit.script, ("grad-cam", "poly-cam"), "the module that it was made of"),
+        (
+            lambda module: torch.ao.quantization.quantize_dynamic(module, {nn.Linear}),
+            ("integrated-gradients", "shapley", "smooth-grad"),
+            "before it was quantised",
+        ),
+    ],
+    ids=["TorchScript", "quantised"],
+)
+def test_modules_without_layers_or_gradients_are_refused_or_take_occlusion(
+    frames: np.ndarray, change: Callable, methods: tuple[str, ...], cure: str
+):
+    network = sl.wrap(change(nn.Sequential(nn.Flatten(), nn.Linear(3 * SIZE**2, 1)).eval()), size=SIZE)
+    for method in methods:
+        with pytest.raises(ModelError, match=cure):
+            sl.explain(network, frames[:1], method=method)
+    explanation = sl.explain(network, frames[:2], method="occlusion")
+    assert sl.score(network, explanation, random_orders=1, steps=0).frames == 2
+
+
+class OnDevice(Tensor):
+    """Tensor on a device without float64; what is computed from it stays there until `cpu`."""
+
+    @classmethod
+    def __torch_function__(cls, func: Callable, types: tuple, args: tuple = (), kwargs: dict | None = None) -> object:
+        result = super().__torch_function__(func, types, args, kwargs or {})
+        if func is Tensor.cpu and isinstance(result, Tensor):
+            return result.as_subclass(Tensor)
+        if isinstance(result, OnDevice) and result.dtype == torch.float64:
+            raise TypeError("the device has no float64")
+        return result
+
+
+@pytest.mark.filterwarnings("ignore:Setting forward, backward hooks")
+def test_methods_and_measures_do_without_float64(frames: np.ndarray, monkeypatch: pytest.MonkeyPatch):
+    module, images = small_module(), images_of(frames)[:2]
+    on_device = images.as_subclass(OnDevice)
+    with pytest.raises(TypeError, match="no float64"):
+        get_explainer("integrated-gradients")(module, on_device)
+    monkeypatch.setattr(attribution, "lacks_float64", lambda _: True)
+    explainers = [get_explainer(name, **FAST.get(name, {})) for name in METHODS]
+    maps = [explainer(module, on_device).relevance for explainer in explainers]
+    for explainer, relevance in zip(explainers, maps, strict=True):
+        np.testing.assert_allclose(relevance.cpu().numpy(), explainer(module, images).relevance.numpy(), atol=1e-5)
+    relevance = maps[0]
+    measured = controls.infidelity(module, on_device, 0 * on_device, relevance)
+    np.testing.assert_allclose(measured, controls.infidelity(module, images, 0 * images, relevance.cpu()), rtol=1e-4)
+    assert np.isfinite(controls.max_sensitivity(lambda inputs: inputs.mean(dim=1), on_device)).all()
+
+
+def test_predictions_are_written_in_the_unit_of_the_output(frames: np.ndarray):
+    predictions = sl.predict(sl.wrap(small_module(), size=SIZE, unit="N"), frames)
+    values = predictions.to_arrow()["prediction"].to_numpy()
+    assert f"output {np.median(values):.3g} N (median)" in predictions.summary
+    figure = sl.plot(predictions)
+    assert "N" in figure.axes[0].get_ylabel()
+    drawn = np.asarray(figure.axes[0].lines[0].get_ydata())
+    np.testing.assert_allclose(drawn.astype(float), values)
 
 
 def test_channels_last_maps_are_refused_by_the_cam_family(frames: np.ndarray):

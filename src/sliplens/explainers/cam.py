@@ -114,6 +114,11 @@ def find_published_layers(model: nn.Module, images: Float[Tensor, "batch colours
 
 def _record(model: nn.Module, images: Tensor) -> _Call:
     """Run the network and return the tree of its module calls."""
+    if any(isinstance(module, torch.jit.ScriptModule) for module in model.modules()):
+        raise ModelError(
+            "the layers of a TorchScript module cannot be recorded; explain the module that it was made of, or use "
+            "integrated-gradients, smooth-grad, occlusion or shapley"
+        )
     finished: list[_Call] = []  # those whose caller is still at work
     begun: list[int] = []
 

@@ -256,7 +256,15 @@ class Method(ABC):
             images, reference = (
                 tensor.to(device=weights.device, dtype=weights.dtype).detach().clone() for tensor in (images, reference)
             )
-            attribution = self._explain(Comparison(model=model, images=images, references=reference))
+            try:
+                attribution = self._explain(Comparison(model=model, images=images, references=reference))
+            except RuntimeError as error:
+                if "used in the graph" not in str(error):
+                    raise
+                raise ModelError(
+                    "the model's output has no gradient, such as that of a quantised module; explain the module before "
+                    "it was quantised, or use occlusion, which needs none"
+                ) from error
         if attribution.relevance.is_cuda:
             torch.cuda.synchronize(attribution.relevance.device)
         return replace(attribution, method=self.method, seconds=time.perf_counter() - start)

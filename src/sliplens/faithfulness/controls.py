@@ -75,7 +75,7 @@ def infidelity(
         return gone.expand_as(expanded), expanded - gone * (images - references).repeat_interleave(samples, dim=0)
 
     squares = metrics.infidelity(predict, replace_half, images, shares, n_perturb_samples=samples)
-    return squares.double().sqrt().cpu().numpy()
+    return squares.cpu().double().sqrt().numpy()
 
 
 def max_sensitivity(
@@ -102,7 +102,7 @@ def max_sensitivity(
         return explain(inputs) if isinstance(inputs, Tensor) else (explain(inputs[0]),)
 
     largest = metrics.sensitivity_max(explain_alike, images, perturb_func=disturb, n_perturb_samples=samples)
-    return largest.double().cpu().numpy()
+    return largest.cpu().double().numpy()
 
 
 def relevance_mass(saliency: Float[np.ndarray, "_ _"], truth: Bool[np.ndarray, "height width"]) -> float:
@@ -225,6 +225,8 @@ def cascade(model: nn.Module, *, seed: int, stages: int, images: Images) -> Iter
         for module in changed.modules()
         if hasattr(module, "reset_parameters") and next(module.parameters(recurse=False), None) is not None
     ][::-1]
+    if not weighted:
+        raise ModelError("no layer has reset_parameters, by which its weights are drawn anew; add it to your layers")
     ends = {round((stage + 1) * len(weighted) / stages) for stage in range(stages)}
     for count, module in enumerate(weighted, start=1):
         with torch.random.fork_rng(devices=[]):

@@ -141,7 +141,7 @@ def track(
     if (sensor := source_options.get("sensor")) is not None:
         source_options["sensor"] = load_profile(sensor)
     trials = open_trials(source, on=on, resumable=path is not None, **source_options)
-    metadata = {"sliplens.source": trials.kinds[0].opened, "sliplens.markers": markers}
+    metadata = {"sliplens.markers": markers}
     schema = pa.schema(list(_COLUMNS.items()), metadata={"sliplens.version": __version__, **metadata})
     recipe = {**metadata, "source": trials.recipe}
     outcomes: list[TrialTracking] = []

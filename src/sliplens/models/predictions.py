@@ -62,6 +62,8 @@ class Predictions(Result):
     frames: int
     engine: str
     """Engine that ran the network, one of `ENGINES`."""
+    unit: str = "margin"
+    """Unit of the predictions; `margin` for safety margins in [0, 1], empty if unknown."""
     path: Path | None
     """File of the rows; None where they are kept in memory."""
     rows: pa.Table | None
@@ -95,16 +97,19 @@ class Predictions(Result):
 
     @property
     def summary(self) -> str:
-        """Margins in a sentence."""
-        rows = self.to_arrow()
-        margin = 100 * rows["prediction"].drop_null().to_numpy()
+        """Predictions in a sentence."""
+        rows, of_margin = self.to_arrow(), self.unit == "margin"
+        values = rows["prediction"].drop_null().to_numpy()
         words = f"{number_of(self.frames, 'frame')} by {self.engine}"
-        if "touches" in rows.column_names and not rows["touches"].to_numpy().any():
+        if of_margin and "touches" in rows.column_names and not rows["touches"].to_numpy().any():
             return f"{words}, nothing touches the sensor in any of them: there is no margin"
-        if len(margin):
-            lowest, highest = f"{margin.min():.0f}", f"{margin.max():.0f}"
-            words += f", safety margin {np.median(margin):.0f} % (median), from {lowest} to {highest} %"
-        return words if len(margin) == self.frames else f"{words}, {self.frames - len(margin):,} withheld"
+        if len(values):
+            numbers = np.median(values), values.min(), values.max()
+            middle, low, high = (
+                f"{100 * number:.0f} %" if of_margin else f"{number:.3g} {self.unit}".rstrip() for number in numbers
+            )
+            words += f", {'safety margin' if of_margin else 'output'} {middle} (median), from {low} to {high}"
+        return words if len(values) == self.frames else f"{words}, {self.frames - len(values):,} withheld"
 
     def __arrow_c_stream__(self, requested_schema: object = None) -> object:
         """Return the rows as an Arrow stream (the Arrow PyCapsule interface)."""
@@ -246,7 +251,6 @@ def predict(
         for sentence in notes:
             add_note(sentence)
         metadata = {
-            "sliplens.source": kinds[0].opened,
             "sliplens.manifest_hash": hash_json(network.manifest),
             "sliplens.weights_sha256": network.manifest.weights_sha256,
         }
@@ -268,7 +272,15 @@ def predict(
             overwrite=overwrite,
         )
     name = (written.metadata or {})[b"sliplens.engine"].decode()
-    return Predictions(frames=trials.frames, engine=name, path=path, rows=rows, schema=path and written, notes=notes)
+    return Predictions(
+        frames=trials.frames,
+        engine=name,
+        unit=network.manifest.unit,
+        path=path,
+        rows=rows,
+        schema=path and written,
+        notes=notes,
+    )
 
 
 def _list_notes(

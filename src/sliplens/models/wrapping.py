@@ -50,7 +50,7 @@ def one_output(output: object, images: int) -> Float[Tensor, " batch"]:
         what = f"shape {tuple(output.shape)}" if isinstance(output, Tensor) else f"type {type(output).__name__}"
         raise ModelError(
             f"the model's output has {what} for {images} image(s), not one number an image; end it with one output, "
-            "such as Linear(features, 1), or choose one with sliplens.wrap(model, output=0)"
+            "such as Linear(features, 1), or choose one with sliplens.wrap(model, output=0), its place or its key"
         )
     return output.reshape(images)
 
@@ -108,16 +108,21 @@ def wrap(
         kind = type(module).__name__
         raise ModelError(f"a {kind} is no module; build the torch.nn.Module, and load its weights with load_state_dict")
     trains = [type(part).__name__ for part in module.modules() if part.training and isinstance(part, _NEEDS_EVAL)]
+    if size < 1:
+        raise ModelError(f"size is {size}; give the height and width of the module's input in pixels, such as 224")
     if trains:
         raise ModelError(
             f"the module is in training mode, in which {trains[0]} makes predictions depend on the batch; call "
             "module.eval() first"
         )
+    module = getattr(module, "_orig_mod", module)  # of torch.compile, which runs no hooks
     row, model = pick(ENCODINGS, encoding, noun="encoding"), OneOutput(module, preprocess, output)
     device = next(module.parameters(), torch.empty(0)).device
     try:
         with torch.no_grad():
             model(torch.zeros(2, row.colours, size, size, device=device))
+    except ModelError:
+        raise
     except Exception as error:  # whatever a module of others raises
         raise ModelError(
             f"the module does not run on images of shape (2, {row.colours}, {size}, {size}) "

@@ -23,26 +23,30 @@ from sliplens.results.faithfulness import CHANCE, DeletionCurve, RemovalCurve
 MARGIN_LABEL = "Safety margin Γ (%)"
 
 
-def plot_margins(rows: pa.Table, *, ax: Axes) -> Axes:
+def plot_margins(rows: pa.Table, *, ax: Axes, unit: str = "margin") -> Axes:
     """Draw the margin of one trial with its 90 % interval over time or frames, and the label where there is one.
 
-    Frames whose margin is withheld are grey, and the legend says why.
+    Frames whose margin is withheld are grey, and the legend says why. Predictions of another `unit` are drawn in it.
     """
     timed = "time_s" in rows.column_names and rows["time_s"].null_count == 0
     across = column(rows, "time_s" if timed else "frame")
     _shade_withheld(across, rows["withheld"].to_pylist(), ax=ax)
-    nothing = np.full(len(rows), np.nan)
+    nothing, of_margin = np.full(len(rows), np.nan), unit == "margin"
     prediction, low, high, true = (
         column(rows, name) if name in rows.column_names else nothing
         for name in ("prediction", "low_90", "high_90", "safety_margin")
     )
-    _plot_prediction(across, prediction, low, high, true, ax=ax)
+    shown = (prediction, low, high, true) if of_margin else (prediction / 100, nothing, nothing, nothing)
+    _plot_prediction(across, *shown, ax=ax)
     ax.axhline(0, color=style.GREY, linewidth=0.8)
-    ax.set(xlabel="Time (s)" if timed else "Frame", ylabel=MARGIN_LABEL)
+    ax.set(
+        xlabel="Time (s)" if timed else "Frame", ylabel=MARGIN_LABEL if of_margin else f"Output ({unit or 'its unit'})"
+    )
     if not timed:
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     low, high = ax.get_ylim()
-    ax.set_ylim(min(low, -4), max(high, 104))
+    if of_margin:
+        ax.set_ylim(min(low, -4), max(high, 104))
     ax.legend(loc="lower left", bbox_to_anchor=(0.0, 0.99), ncols=2, borderaxespad=0.2)
     lines = -(-len(ax.get_legend_handles_labels()[0]) // 2)
     ax.set_title(rows["trial"][0].as_py(), parse_math=False, pad=6 + 15 * lines)

@@ -230,7 +230,9 @@ DRAWERS: dict[str, Callable[[Any, Axes, int | None], object]] = {
     "Faithfulness": _faithfulness,
     "Study": _study,
     "Truth": _truth,
-    "Predictions": lambda result, ax, index: charts.plot_margins(_rows_of_trial(result.to_arrow(), index), ax=ax),
+    "Predictions": lambda result, ax, index: charts.plot_margins(
+        _rows_of_trial(result.to_arrow(), index), ax=ax, unit=result.unit
+    ),
     "ScoredFrames": lambda result, ax, index: charts.plot_margins(_rows_of_trial(result.to_arrow(), index), ax=ax),
     "Tracking": _tracking,
     "Grip": lambda of, ax, _: charts.plot_grip_force(of.trace.to_arrow(), ax=ax).set_title(of.setup.controller),

@@ -206,6 +206,7 @@ class Faithfulness(OfOutput):
     scores: tuple[RemovalScore, ...]
     """Scores by fill, unit and method, controls included, with intervals over days and trials."""
     comparisons: tuple[RemovalGap, ...]
+    """Gaps of every two methods under each fill and unit, with intervals of the paired difference."""
     alarms: tuple[str, ...]
     """Reasons why a score may not measure the maps."""
     table: RemovalTable
@@ -247,14 +248,17 @@ class Faithfulness(OfOutput):
 
     @property
     def summary(self) -> str:
-        """Gain of the best method in a sentence."""
+        """Gain of the best method, over the best control and the next method, in a sentence."""
         counts = f"{number_of(self.frames, 'frame')} of {number_of(self.trials, 'trial')}"
         methods = [score for score in self.scores if not score.control and score.key[:2] == self.scores[0].key[:2]]
         if not methods:
             return f"no method was scored; {counts}"
-        best = max(methods, key=lambda score: score.srg.estimate)
-        lead = best.lead_over_controls
+        best, *others = sorted(methods, key=lambda score: -score.srg.estimate)
+        lead, compared = best.lead_over_controls, {best.method, *(score.method for score in others[:1])}
         over = "" if lead is None else f", {lead.gap} over the best control ({lead.control})"
+        for each in self.comparisons:
+            if {each.first, each.second} == compared and (each.fill, each.unit) == best.key[:2]:
+                over += f"; that of {each.first} less that of {each.second} {each.gap}"
         return f"symmetric relevance gain of {best.method} {best.srg} {self.unit_words}{over}; {counts}"
 
 

@@ -50,6 +50,7 @@ def table(*, header: str = "time_s,fx,fy,fz", separator: str = ",", comma: bool 
         .replace("\n", ";0\n")
         .replace(";Tx;0\n", ";Tx\n[s];[N];[N];[N];[Nm]\n"),
         table().replace("-", "\u2212"),
+        "F/T Sequence," + table(header="Time,Fx,Fy,Fz").rstrip().replace("\n", "\n7,"),
     ],
 )
 def test_layout_and_names_of_columns_do_not_matter(tmp_path: Path, text: str):

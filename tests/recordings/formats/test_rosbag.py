@@ -15,6 +15,8 @@ from readers import read_rosbag, refused
 from there import there
 
 from sliplens.errors import InputError, RecordingError
+from sliplens.recordings.formats import open_captures
+from sliplens.recordings.options import ReadOptions
 
 pytest.importorskip("rosbags")
 
@@ -298,7 +300,8 @@ def test_a_path_that_is_no_bag_is_refused(tmp_path, frames_of):
     (tmp_path / "old.bag").write_bytes(b"#ROSBAG V2.0\n")
     refused(read_rosbag, bag, r"has no metadata\.yaml; write it with `ros2 bag reindex`, or name bag\.mcap")
     refused(read_rosbag, tmp_path, r"has no metadata\.yaml; .* or name the folder of a bag")
-    refused(read_rosbag, tmp_path / "old.bag", "is a ROS 1 bag; convert it with `rosbags-convert")
+    with pytest.raises(RecordingError, match="is a ROS 1 bag; convert it with `rosbags-convert"):
+        open_captures(tmp_path / "old.bag", options=ReadOptions())
 
 
 def test_files_of_something_else_are_refused(tmp_path, frames_of):

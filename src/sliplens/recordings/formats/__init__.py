@@ -42,7 +42,7 @@ _ROWS = {
     ),
     "rosbag": Reader(
         words="ROS 2 bag (MCAP or sqlite3)",
-        recognises=lambda path: path.suffix in {".mcap", ".db3"} or (path / "metadata.yaml").is_file(),
+        recognises=lambda path: path.suffix in {".mcap", ".db3", ".bag"} or (path / "metadata.yaml").is_file(),
         takes=("image_topic", "wrench_topic"),
         read=read_rosbag,
     ),

@@ -70,11 +70,11 @@ def bag_messages(path: Path, topics: Mapping[str, str]) -> Iterator[tuple[str, i
 @contextmanager
 def open_bag(path: Path) -> Iterator["Reader"]:
     """Open a bag; whatever its readers raise inside becomes a `RecordingError`."""
+    if path.suffix == ".bag":
+        raise RecordingError(f"{path} is a ROS 1 bag; convert it with `rosbags-convert --src BAG --dst FOLDER`")
     require_packages("rosbags", extra="ros", purpose="a ROS 2 bag")
     from rosbags.rosbag2 import Reader  # noqa: PLC0415 (an extra)
 
-    if path.suffix == ".bag":
-        raise RecordingError(f"{path} is a ROS 1 bag; convert it with `rosbags-convert --src BAG --dst FOLDER`")
     files = sorted(file for file in path.iterdir() if file.suffix in _STORAGE) if path.is_dir() else [path]
     if path.is_dir() and not (path / "metadata.yaml").is_file():
         inside = " or ".join(file.name for file in files[:3]) or "the folder of a bag"

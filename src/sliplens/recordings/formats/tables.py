@@ -251,7 +251,8 @@ def is_time(name: str) -> bool:
     words, bracket = _words(name), re.search(r"[\[(]\s*(\w+)\s*[\])]", name.lower())
     if _find_unit(bracket[1] if bracket else words[0] if len(words) == 1 else "", "time"):
         return True
-    return bool(_TIME & set(words)) and _axis(words) is None  # "f_t" is a tangential force
+    # "f_t" is a tangential force, "F/T" a force/torque sensor
+    return bool(_TIME & {*words[:1], *(word for word in words if word != "t")}) and _axis(words) is None
 
 
 def guess_time_column(header: Sequence[str], *, path: Path) -> str:
