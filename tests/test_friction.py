@@ -138,9 +138,8 @@ def test_what_a_slip_taught_ends_with_its_grasp_unless_the_object_stays_the_same
         assert learner.friction is told
         assert learner.slips == 1
         # it can be told again, and is as unsure as the slip and two grasps are
-        assert learner.learnt is not None
-        assert learner.learnt.mean == pytest.approx(ratio, rel=0.03)
-        assert learner.learnt.sigma == pytest.approx(np.hypot(0.03, 0.06 * ratio), rel=0.1)
+        assert there(learner.learnt).mean == pytest.approx(ratio, rel=0.03)
+        assert there(learner.learnt).sigma == pytest.approx(np.hypot(0.03, 0.06 * ratio), rel=0.1)
 
 
 def test_where_nothing_was_told_a_slip_teaches_the_grasps_that_follow():

@@ -12,9 +12,10 @@ import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 import pytest
 from counted_parts import Count, CountInThreads, parts
+from data_sets import contents
 
 from sliplens.errors import InputError, PartError
-from sliplens.files import hash_file, locked
+from sliplens.files import locked
 from sliplens.progress import reporting
 from sliplens.runner import Part, part, require_new_table, run_parts, run_table
 
@@ -44,20 +45,16 @@ def make(
         run_parts(work, parts() if every is None else every, out, **options)  # pyright: ignore
 
 
-def content(folder: Path) -> dict[str, str]:
-    return {str(path.relative_to(folder)): hash_file(path) for path in folder.rglob("*") if path.is_file()}
-
-
 def test_a_part_is_made_once_and_only_what_is_missing_is_made_again(log: Path, out: Path):
     calls: list[tuple[int, int]] = []
     make(Count(log=log), out, listener=lambda done, total: calls.append((done, total)))
-    assert sorted(content(out)) == [each.path for each in parts()]  # and nothing else
+    assert sorted(contents(out)) == [each.path for each in parts()]  # and nothing else
     assert [done for done, _ in calls] == sorted(done for done, _ in calls)
     assert calls[-1] == (15, 15)
-    before = content(out)
+    before = contents(out)
     (out / parts()[0].path).unlink()
     make(Count(log=log), out)
-    assert content(out) == before
+    assert contents(out) == before
     assert Count(log=log).tries() == {"a": 2, "b": 1, "c": 1, "d": 1, "e": 1}
 
 
@@ -77,7 +74,7 @@ def test_an_interruption_loses_only_the_part_being_made(log: Path, out: Path):
         make(Count(log=log), out, listener=interrupt)
     assert sum(path.suffix == ".parquet" and path.name[0] != "." for path in out.rglob("*")) == 2
     make(Count(log=log), out)
-    assert sorted(content(out)) == [each.path for each in parts()]
+    assert sorted(contents(out)) == [each.path for each in parts()]
     assert Count(log=log).tries() == {"a": 1, "b": 1, "c": 2, "d": 1, "e": 1}
 
 
@@ -88,9 +85,9 @@ def test_a_part_that_fails_stops_no_other_and_is_tried_again_by_the_next_call(lo
         make(work, out)
     assert set(raised.value.errors) == {"b", "d"}
     assert work.tries() == dict.fromkeys("abcde", 1)
-    assert len(content(out)) == 3
+    assert len(contents(out)) == 3
     make(Count(log=log), out)
-    assert sorted(content(out)) == [each.path for each in parts()]
+    assert sorted(contents(out)) == [each.path for each in parts()]
     assert Count(log=log).tries() == {"a": 1, "b": 2, "c": 1, "d": 2, "e": 1}
 
 
@@ -99,7 +96,7 @@ def test_a_full_disk_ends_the_work(log: Path, out: Path):
         make(Count(log=log, no_room=frozenset("b")), out)
     assert Count(log=log).tries() == {"a": 1, "b": 1}
     make(Count(log=log), out)
-    assert sorted(content(out)) == [each.path for each in parts()]
+    assert sorted(contents(out)) == [each.path for each in parts()]
 
 
 @pytest.mark.parametrize("on", ["serial", "processes=2"])
@@ -126,13 +123,13 @@ def test_threads_make_the_same_bytes_and_an_interruption_ends_them(log: Path, ou
         make(work, tmp_path / "other", listener=lambda done, _: calls.append(done))
     assert calls[-1] == 12
     make(Count(log=work.log), tmp_path / "other")
-    assert content(tmp_path / "other") == content(out)
+    assert contents(tmp_path / "other") == contents(out)
 
 
 def test_a_single_part_fails_with_its_own_error_and_leaves_nothing(log: Path, out: Path):
     with pytest.raises(InputError, match=r"^a is damaged; record it again$"):
         make(Count(log=log, refuse=frozenset("a")), out, parts("a"))
-    assert not content(out)
+    assert not contents(out)
 
 
 def test_processes_make_the_same_bytes_and_survive_a_kill(log: Path, out: Path, tmp_path: Path):
@@ -149,7 +146,7 @@ def test_processes_make_the_same_bytes_and_survive_a_kill(log: Path, out: Path, 
     assert work.tries()["b"] == 2
     assert os.getpid() not in {int(path.read_text()) for path in work.log.iterdir()}
     make(Count(log=work.log), tmp_path / "other")
-    assert content(tmp_path / "other") == content(out)
+    assert contents(tmp_path / "other") == contents(out)
 
 
 @pytest.mark.skipif("SLIPLENS_RAY" not in os.environ, reason="takes half a minute; SLIPLENS_RAY=1 runs it")
@@ -164,7 +161,7 @@ def test_a_cluster_of_two_nodes_makes_the_same_bytes_and_survives_a_kill(log: Pa
         make(Count(log=log, kill=frozenset("b")), out, on=f"ray={cluster.address}")
     finally:
         cluster.shutdown()
-    assert content(out) == content(out.with_name("serial"))
+    assert contents(out) == contents(out.with_name("serial"))
 
 
 def test_executors_that_cannot_start_are_refused_with_their_cure(log: Path, out: Path, monkeypatch):

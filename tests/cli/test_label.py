@@ -100,9 +100,9 @@ def test_force_samples_are_kept_and_labels_made_anew_from_them_are_the_same(
     np.testing.assert_allclose(after.safety_margin[both], expected[both], atol=1e-9)
     assert load_dataset(tmp_path / "data").trials[0].split == "validation"
     # what the trial came from, what was noted then, and how it was divided stay
-    first, last = (read_header(trial_path(folder, trial.trial)).labelling for folder in (relabelled, tmp_path / "data"))
-    assert first is not None
-    assert last is not None
+    first, last = (
+        there(read_header(trial_path(folder, trial.trial)).labelling) for folder in (relabelled, tmp_path / "data")
+    )
     assert (last.source, last.notes) == (first.source, first.notes)
 
 

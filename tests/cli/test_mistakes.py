@@ -22,15 +22,9 @@ MISTAKES = {
     "train DATA -o OUT --logger wandb": "no logger named 'wandb'; choose csv or tensorboard, or in Python one of",
     "train DATA -o OUT --condition oily": "and condition oily; it has test/dry, test/wet, train/dry, validation/dry",
     "explain RUN --frames FRAMES/tall -o OUT": "a_20.png are 50 x 48 pixels but the network was",
-    "explain RUN --frames FRAMES/clear -o OUT": "drop the alpha",
-    "explain RUN --frames FRAMES/deep -o OUT": "a_20.tiff has 16 bits a channel",
-    "explain RUN --frames FRAMES/cut -o OUT": "a_20.png cannot be read as an image",
     "explain RUN -o OUT": "requires an argument",
     "explain RUN DATA": "name the folder of the maps with -o",
-    "explain RUN DATA -o OUT --trials 0": "--trials must be at least 1, got 0",
     "explain RUN DATA -o OUT --method lime": "no method named 'lime'; choose",
-    "explain RUN DATA -o OUT --budget 2": "budget is 2.0; give a share",
-    "explain RUN --frames FRAMES/good -o OUT --method occlusion-marker": "methods by marker need camera frames",
     "predict RUN DATA -o OUT.txt": "does not end in .parquet or .csv",
     "predict RUN DATA -o OUT.csv --batch-size 0": "--batch-size must be at least 1, got 0",
     "predict NOTHING DATA -o OUT.csv": "the run NOTHING does not exist",
@@ -42,9 +36,7 @@ MISTAKES = {
     "report EMPTY": "EMPTY",
     "demo EMPTY/..": "is no demo; choose another folder",
     f"simulate {SMALL}": "name the folder of the data set with -o FOLDER",
-    "simulate OUT --days 1": "days is 1, but at least 2 are needed",
     f"simulate OUT --seed -1 {SMALL}": "seed is -1",
-    f"simulate OUT --sensor flat-gel --displacement calibrated {SMALL}": "sensor flat-gel has half-space; choose",
     "predict VIDEO --device toaster": "device 'toaster' is not known; use cpu, cuda or cuda:1",
     "predict VIDEO --device cuda:99": "device cuda:99 is not on this machine; use cpu",
     "import VIDEO -o OUT --sensor mine": "has no forces to label it by; give their table",
@@ -65,7 +57,6 @@ MISTAKES = {
     "export onnx DATA -o OUT.onnx": "does not exist; make it with",
     "export onnx RUN -o OUT": "does not end in .onnx",
     "track DATA -o OUT.csv": "does not end in .parquet",
-    "track DATA -o OUT.parquet --markers digit": "there is no kind of markers named 'digit'",
     "track DATA -o OUT.parquet --trial other": "no trial other",
     "track FRAMES/good -o OUT.parquet --reference-frame 9": "has no frame 9",
     "track FRAMES/good -o OUT.parquet": "one frame and no reference",
@@ -102,15 +93,10 @@ def places(
     for name, pixels in {
         "good/a_20.png": np.zeros((48, 48, 3), np.uint8),
         "tall/a_20.png": np.zeros((50, 48, 3), np.uint8),
-        "clear/a_20.png": np.zeros((48, 48, 4), np.uint8),
-        "deep/a_20.tiff": np.zeros((48, 48), np.uint16),
-        "cut/a_20.png": np.zeros((48, 48, 3), np.uint8),
     }.items():
         path = folder / "frames" / name
         path.parent.mkdir(parents=True)
         Image.fromarray(pixels).save(path)
-    path = folder / "frames" / "cut" / "a_20.png"
-    path.write_bytes(path.read_bytes()[:60])
     (folder / "tip.toml").write_text('name = "tip"\nnetwork = "trained-elsewhere"\n', encoding="utf-8")
     return {
         "NOTHING": str(folder / "nothing"),

@@ -133,6 +133,8 @@ def test_a_pixel_belongs_to_the_nearest_marker_or_to_none():
         for column in range(9):
             distance = np.hypot(centres[:, 0] - column, centres[:, 1] - row)
             assert units[row, column] == (distance.argmin() if distance.min() <= 2 else 2)
+    with pytest.raises(InputError, match="two or more, and there are 0; choose tiles"):
+        marker_regions((6, 9), torch.empty(0, 2), radius_px=2.0)
 
 
 @given(MAPS, st.integers(1, 5), st.booleans())

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from data_sets import save_dataset
 from made_up import write_workspace
 from own_recording import write_video
 from PIL import Image
@@ -37,13 +38,12 @@ from sliplens.recordings import import_recordings, label_dataset, load_dataset
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.check import check_dataset
 from sliplens.recordings.corrections import read_corrections
-from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.labelling import Reason
 from sliplens.recordings.options import LabelSettings, ReadOptions
 from sliplens.recordings.sensor import load_profile
 from sliplens.recordings.source import open_source
 from sliplens.recordings.splits import assign_splits, read_split_table
-from sliplens.recordings.store import forces_path, save_forces, save_recording
+from sliplens.recordings.store import forces_path, save_forces
 from sliplens.recordings.trial import Labels, TrialFacts
 from sliplens.results.study import load_results
 
@@ -253,15 +253,12 @@ TRIAL = {**ANY, **COLUMNS, "header": _header, "images": _blobs}
 
 
 def _data_set(folder: Path) -> None:
-    table = []
-    for index, split in enumerate(("train", "test")):
-        trial = make_recording(f"trial-{index}", seed=index)
-        save_recording(trial, trial_path(folder, trial.trial))
+    trials = [make_recording(f"trial-{index}", seed=index) for index in range(2)]
+    for index, trial in enumerate(trials):
         time = np.linspace(-0.5, 0.5, 200)
         force = np.random.default_rng(index).normal(0, 0.02, (200, 3)) + np.clip(time, 0, 0.2)[:, None] * [1, 0, 9]
         save_forces(Forces(time_s=time, force_n=force, source="made up"), forces_path(folder, trial.trial))
-        table.append(trial_info(trial_path(folder, trial.trial), split=split))
-    write_dataset_table(folder, table)
+    save_dataset(folder, *trials, split=("train", "test"))
 
 
 def _hashes(folder: Path) -> None:
@@ -406,13 +403,11 @@ def claim_size(path: Path, size: tuple[int, int]) -> None:
     path.write_bytes(data)
 
 
-def _claim(path: Path, rng: Rng) -> None:
-    claim_size(path, tuple(rng.integers(1, 2**15, 2).tolist()))
-
-
 PICTURE: dict[str, Change] = {
-    **ANY, "bomb": lambda path, _: path.write_bytes(bomb()), "claims a size": _claim, "jpeg": _as("JPEG", "RGB"),
-    "palette": _as("PNG", "P"), "alpha": _as("PNG", "RGBA"), "gif": _as("GIF", "P"),
+    **ANY,
+    "bomb": lambda path, _: path.write_bytes(bomb()),
+    "claims a size": lambda path, rng: claim_size(path, tuple(rng.integers(1, 2**15, 2).tolist())),
+    "jpeg": _as("JPEG", "RGB"), "palette": _as("PNG", "P"), "alpha": _as("PNG", "RGBA"), "gif": _as("GIF", "P"),
 }  # fmt: skip
 
 

@@ -41,6 +41,7 @@ import numpy as np  # noqa: E402
 import pyarrow as pa  # noqa: E402
 import torch  # noqa: E402
 from changes import count_changes  # noqa: E402
+from data_sets import save_dataset  # noqa: E402
 from hostile import FORMATS  # noqa: E402
 from outcomes import in_a_child, parser, resume, tabulate  # noqa: E402
 from small import make_recording, save_untrained  # noqa: E402
@@ -51,13 +52,7 @@ import sliplens.study.run as study  # noqa: E402
 from sliplens.cli import main as command  # noqa: E402
 from sliplens.cli.console import say  # noqa: E402
 from sliplens.recordings import load_dataset  # noqa: E402
-from sliplens.recordings.dataset import (  # noqa: E402
-    JOURNAL_FOLDER,
-    trial_info,
-    trial_path,
-    write_dataset_table,
-)
-from sliplens.recordings.store import save_recording  # noqa: E402
+from sliplens.recordings.dataset import JOURNAL_FOLDER  # noqa: E402
 from sliplens.results.study import StudyConfig  # noqa: E402
 
 FAULTS = ("kill", "kill at a change", "interrupt", "memory", "disk", "read-only", "removed", "twice", "clock")
@@ -275,13 +270,9 @@ def make_material(folder: Path) -> None:
         "trial,video,forces,day,mu,sensor\n" + "".join(f"{name},cup,forces.csv,1,0.6,tip\n" for name in ("a", "b"))
     )
     (folder / "splits.csv").write_text("trial,split\n*1,train\n*,test\n")
-    table = []
-    plan = [("train", "dry")] * 3 + [("validation", "dry")] * 2 + [("test", "dry")] * 2
-    for index, (split, condition) in enumerate(plan):
-        trial = make_recording(f"{split}-{index}", condition=condition, day=1 + index % 3, frames=12, seed=index)
-        save_recording(trial, path := trial_path(folder / "data", trial.trial))
-        table.append(trial_info(path, split=split))
-    write_dataset_table(folder / "data", table)
+    splits = ["train"] * 3 + ["validation"] * 2 + ["test"] * 2
+    trials = [make_recording(f"{split}-{at}", day=1 + at % 3, seed=at) for at, split in enumerate(splits)]
+    save_dataset(folder / "data", *trials, split=splits)
     save_untrained(folder / "run")
     save_untrained(folder / "of-drawn", frame_size=224)
     drawn = ("--dry-trials", "5", "--wet-trials", "1", "--frames-per-trial", "40", "--days", "3")

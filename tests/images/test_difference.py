@@ -17,11 +17,6 @@ def test_difference_is_the_absolute_difference_of_integers(frame: np.ndarray, re
     np.testing.assert_array_equal(absolute_difference(reference, frame), expected)
 
 
-@given(PIXELS)
-def test_a_frame_does_not_differ_from_itself(frame: np.ndarray):
-    assert not absolute_difference(frame, frame).any()
-
-
 def test_a_reference_of_another_size_is_refused():
     with pytest.raises(ImageError, match=r"frame of 4 x 4 pixels against a reference of 5 x 4"):
         absolute_difference(np.zeros((4, 4, 3), np.uint8), np.zeros((5, 4, 3), np.uint8))

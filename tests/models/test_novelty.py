@@ -22,9 +22,7 @@ def read_features(model: nn.Module, layer: str, images: torch.Tensor) -> np.ndar
 def test_the_layer_answers_with_an_eighth_of_the_side_whatever_the_backbone():
     for backbone in ("shufflenet_v2_x0_5", "resnet18", "mobilenet_v3_small"):
         model, images = build_model(backbone).eval(), torch.zeros(1, 3, 64, 64)
-        layer = find_layer(model, images)
-        assert layer is not None
-        shapes = []
+        layer, shapes = there(find_layer(model, images)), []
         handle = model.get_submodule(layer).register_forward_hook(lambda _, __, out, shapes=shapes: shapes.append(out))
         model(images)
         handle.remove()

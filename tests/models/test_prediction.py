@@ -130,11 +130,8 @@ def refused(source: Path, trained: Network, kind: type[Exception], message: str,
 def test_what_is_missing_or_too_much_is_refused(
     trained: Network, small_dataset: Dataset, wet: Recording, tmp_path: Path
 ):
-    image, folder, data = (
-        tmp_path / "untouched.png",
-        write_frames(tmp_path / "frames", wet.frames),
-        small_dataset.folder,
-    )
+    image, data = tmp_path / "untouched.png", small_dataset.folder
+    folder = write_frames(tmp_path / "frames", wet.frames)
     write_png(image, wet.reference)
     small = write_frames(tmp_path / "small", np.ascontiguousarray(wet.frames[:, :40]))
     refused(folder, trained, InputError, "named twice", reference=image, reference_frame=0)

@@ -1,5 +1,3 @@
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -89,13 +87,6 @@ def test_it_reads_real_touch_it_was_never_trained_on(chromatouch_folder: Path):
     low, high = estimate.interval(0.9) or (labels, labels)
     # five intervals of 90 %: three or fewer hold with a chance below 0.09
     assert np.count_nonzero((low <= labels) & (labels <= high)) >= 4
-
-
-def test_networks_are_loaded_without_the_compiler_and_pandas():
-    script = "import sys, sliplens.models.predictions; print([name for name in sys.argv[1:] if name in sys.modules])"
-    words = ["torch._dynamo", "torch._inductor", "pandas", "scipy.special", "matplotlib"]
-    told = subprocess.run([sys.executable, "-c", script, *words], capture_output=True, text=True, check=True)
-    assert told.stdout.strip() == "[]"
 
 
 def test_the_network_may_be_left_out():

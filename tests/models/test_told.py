@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import stats
+from there import there
 
 from sliplens.errors import InputError
-from sliplens.friction import Friction
+from sliplens.friction import Friction, as_friction
 from sliplens.models import Network
 from sliplens.models.calibration import condition_on_friction
 
@@ -70,11 +71,9 @@ def test_a_range_is_as_drawing_many_frictions(friction: tuple[float, float], rng
 def test_a_network_of_two_answers_takes_friction(networks: dict[str, Network], images):
     trained = networks["margin-and-ratio"]
     untold, exact = trained.estimate(images), trained.estimate(images, friction=0.6)
-    assert untold.ratio is not None
-    assert untold.ratio.probabilities.shape == (5, 80)
-    interval = exact.interval(0.9)
-    assert interval is not None
-    assert np.all((interval[0] >= 0) & (interval[1] <= 1))
+    assert there(untold.ratio).probabilities.shape == (5, 80)
+    low, high = there(exact.interval(0.9))
+    assert np.all((low >= 0) & (high <= 1))
     assert str(exact.friction) == "0.6, exact"
     again = trained.estimate(images, friction="0.6")
     np.testing.assert_array_equal(exact.margin, again.margin)
@@ -89,21 +88,13 @@ def test_a_network_of_one_answer_refuses_friction(head: str, networks: dict[str,
 
 
 @pytest.mark.parametrize(
-    ("friction", "doubted"),
-    [
-        (Friction(0.6), False),
-        (Friction(5.0), True),
-        (Friction(0.05), True),
-        (Friction.between(0.5, 1.5), False),
-        (Friction.between(0.5, 9.0), True),
-    ],
+    ("told", "doubted"), [(0.6, False), (5.0, True), (0.05, True), ((0.5, 1.5), False), ((0.5, 9.0), True)]
 )
 def test_friction_that_is_mostly_beyond_the_training_is_doubted(
-    friction: Friction, doubted: bool, networks: dict[str, Network]
+    told: float | tuple[float, float], doubted: bool, networks: dict[str, Network]
 ):
-    kept = networks["margin-and-ratio"].manifest
-    assert kept.traction is not None
-    manifest = replace(kept, traction=replace(kept.traction, friction=tuple(TRAINED)))
+    kept, friction = networks["margin-and-ratio"].manifest, as_friction(told)
+    manifest = replace(kept, traction=replace(there(kept.traction), friction=tuple(TRAINED)))
     doubts = replace(networks["margin-and-ratio"], manifest=manifest).doubts(friction=friction)
     assert ["0.15 to 1.2" in words for words in doubts] == [True] * doubted
     assert networks["histogram"].doubts(friction=friction) == ()

@@ -1,13 +1,15 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from made_up import explained, frames_named
 from matplotlib.colors import to_rgb
 from PIL import Image
 
 from sliplens.images import read_image
 from sliplens.plots.saliency import draw_explanation, full_colour, overlay_relevance
 from sliplens.plots.style import ORANGE, SKY
-from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes
+from sliplens.results.explanation import Explanation, MethodNotes
 
 
 def test_relevance_is_orange_below_zero_and_blue_above():
@@ -46,27 +48,19 @@ def test_without_relevance_the_picture_shines_through_in_grey(rng):
 
 def of_relevance(relevance: np.ndarray) -> Explanation:
     """Explanations of grey frames 0, 1, ..."""
-    frame = {"trial": "t", "condition": "dry", "safety_margin": 0.2, "prediction": 0.2, "reference_prediction": 1.0}
-    return Explanation(
-        input="difference",
-        source="real",
-        weights_sha256="",
-        frames=tuple(ExplainedFrame(id=str(number), **frame) for number in range(len(relevance))),
-        methods={"occlusion": MethodNotes(seconds_per_frame=0.0, warnings=())},
-        images=np.full((len(relevance), 3, 8, 8), 100, dtype=np.uint8),
-        references=np.full((len(relevance), 3, 8, 8), 100, dtype=np.uint8),
-        pictures=np.full((len(relevance), 8, 8, 3), 100, dtype=np.uint8),
-        relevance={"occlusion": relevance},
-    )
+    count, notes = len(relevance), {"occlusion": MethodNotes(seconds_per_frame=0.0, warnings=())}
+    frames = frames_named([str(number) for number in range(count)], [0.2] * count, [0.2] * count)
+    pictures = np.full((count, 8, 8, 3), 100, dtype=np.uint8)
+    return replace(explained("difference", frames, notes, pictures, {}), relevance={"occlusion": relevance})
 
 
 def test_a_frame_with_nothing_to_explain_looks_empty(tmp_path: Path):
     relevance = np.zeros((2, 8, 8), dtype=np.float32)
     relevance[0, 2:4, 2:4] = -0.2  # 80 points of margin; the second frame changes by a hundredth of a point
     relevance[1, 2:4, 2:4] = 0.000025
-    explained = of_relevance(relevance)
-    draw_explanation(explained, tmp_path)
-    strong, empty = (read_image(tmp_path / "overlays" / "occlusion" / f"{one.id}.png") for one in explained.frames)
+    explanation = of_relevance(relevance)
+    draw_explanation(explanation, tmp_path)
+    strong, empty = (read_image(tmp_path / "overlays" / "occlusion" / f"{one.id}.png") for one in explanation.frames)
     assert np.ptp(strong[2, 2].astype(int)) > 100
     assert np.ptp(empty.astype(int)) <= 1
     with Image.open(tmp_path / "panel.png") as panel:

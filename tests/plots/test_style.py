@@ -1,4 +1,4 @@
-"""Numbers and names as text, and files that appear when complete."""
+"""Numbers and names as text, and files of pictures."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from sliplens.errors import InputError
-from sliplens.plots.style import name_methods, percent, require_picture_path, save_page, written_whole
+from sliplens.plots.style import name_methods, percent, require_picture_path, save_page
 
 
 @pytest.mark.parametrize(
@@ -29,21 +29,6 @@ def test_methods_in_a_text_are_named_and_other_words_stay():
 def test_another_suffix_is_refused(name: str):
     with pytest.raises(InputError, match=r"does not end in \.png, .*; name"):
         require_picture_path(Path(name), example="a.png")
-
-
-@pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
-def test_what_fails_leaves_the_file_before_and_nothing_else(tmp_path: Path, error: type[BaseException]):
-    target = tmp_path / "page.png"
-    target.write_bytes(b"yesterday's")
-
-    def fail() -> None:
-        with written_whole(target) as part:
-            part.write_bytes(b"half")
-            raise error
-
-    with pytest.raises(error):
-        fail()
-    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("page.png", b"yesterday's")]
 
 
 def test_a_page_is_the_same_each_time_and_leaves_matplotlib_as_it_was(tmp_path: Path):

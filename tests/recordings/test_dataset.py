@@ -24,14 +24,7 @@ from sliplens.recordings.store import (
 from sliplens.recordings.trial import SIGNALS
 
 
-def test_a_trial_comes_back_without_loss(tmp_path: Path, recording: Recording):
-    save_recording(recording, tmp_path / "a.parquet")
-    back = load_recording(tmp_path / "a.parquet")
-    for field in fields(Recording):
-        np.testing.assert_array_equal(getattr(back, field.name), getattr(recording, field.name))
-
-
-def test_a_trial_of_many_chunks_comes_back_whole(tmp_path: Path, recording: Recording):
+def test_a_trial_of_many_chunks_comes_back_without_loss(tmp_path: Path, recording: Recording):
     count = 2 * ROW_GROUP + 5
     long = replace(
         recording,
@@ -43,8 +36,8 @@ def test_a_trial_of_many_chunks_comes_back_whole(tmp_path: Path, recording: Reco
     save_recording(long, tmp_path / "a.parquet")
     assert pq.ParquetFile(tmp_path / "a.parquet").num_row_groups == 3
     back = load_recording(tmp_path / "a.parquet")
-    np.testing.assert_array_equal(back.frames, long.frames)
-    np.testing.assert_array_equal(back.time_s, long.time_s)
+    for field in fields(Recording):
+        np.testing.assert_array_equal(getattr(back, field.name), getattr(long, field.name))
     np.testing.assert_array_equal(pq.read_table(tmp_path / "a.parquet")["frame"].to_numpy(), np.arange(count))
     places = [count - 1, 0, ROW_GROUP, ROW_GROUP - 1, 0]
     np.testing.assert_array_equal(read_frames(tmp_path / "a.parquet", places), long.frames[places])
@@ -78,14 +71,6 @@ def test_no_more_than_a_few_frames_are_held_while_a_long_trial_is_encoded():
     np.testing.assert_array_equal([one[0, 0, 0] for one in decoded], np.arange(100 * workers) % 256)
     # two a worker that wait or are worked on, one a worker that it has just done, and the newest
     assert most <= 3 * workers + 2
-
-
-def test_a_truncated_trial_is_refused(tmp_path: Path, recording: Recording):
-    path = tmp_path / "a.parquet"
-    save_recording(recording, path)
-    path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(RecordingError, match=r"a\.parquet is not a readable Parquet file"):
-        load_recording(path)
 
 
 @pytest.mark.parametrize(

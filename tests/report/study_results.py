@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from made_up import explained, picture_and_maps, write_evaluation, write_run
+from made_up import explained, frames_named, picture_and_maps, write_evaluation, write_run
 
 from sliplens.faithfulness.scoring import frame_columns, score_curves, score_deletion
 from sliplens.intervals import Difference
@@ -149,17 +149,8 @@ def write_states(workspace: Path, made: Made) -> Path:
 
 
 def frames_explained(rows: Sequence[records.ChosenFrame]) -> tuple[ExplainedFrame, ...]:
-    return tuple(
-        ExplainedFrame(
-            id=row.id,
-            trial=row.trial,
-            condition="dry",
-            safety_margin=row.safety_margin,
-            prediction=row.safety_margin + 0.01,
-            reference_prediction=1.0,
-        )
-        for row in rows
-    )
+    margins = [row.safety_margin for row in rows]
+    return frames_named([row.id for row in rows], margins, [margin + 0.01 for margin in margins])
 
 
 def without_maps(name: str, rows: Sequence[records.ChosenFrame]) -> Explanation:
@@ -258,9 +249,7 @@ def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Genera
             frames=len(rows),
             methods={
                 method: records.Localisation(
-                    neutral=interval(value, made.trials),
-                    stick=interval(value, made.trials),
-                    shapley=interval(value, made.trials),
+                    **dict.fromkeys(("neutral", "stick", "shapley"), interval(value, made.trials)),
                     lead_over_controls=None
                     if method in known
                     else Lead(control="edges", gap=interval(value - known["edges"], made.trials)),

@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from there import there
 
 from sliplens.intervals import Difference
 from sliplens.plots.style import UNKNOWN
@@ -133,9 +134,8 @@ def test_a_fill_votes_once_and_not_where_it_cannot_tell_the_truth(made):
     every = [("reference", "pixel"), ("grey", "pixel"), ("blur", "pixel"), ("true", "marker")]
     assert verdict.voting_settings(faithful) == verdict.voting_settings(faithful, truth) == every
     (meta,) = truth.meta
-    assert meta.gap is not None
     # ahead by its mean, but not for sure
-    unsure = replace(meta, fill="grey", gap=replace(meta.gap, low=-0.01))
+    unsure = replace(meta, fill="grey", gap=replace(there(meta.gap), low=-0.01))
     assert verdict.voting_settings(faithful, replace(truth, meta=(meta, unsure))) == [every[0], *every[2:]]
 
 
@@ -278,15 +278,13 @@ def predictions(error: np.ndarray, *, order: np.ndarray | None = None) -> Scored
 
 def test_errors_differ_by_the_means_of_their_squares_over_trials(rng):
     first, second = rng.normal(size=(2, 8, 5))
-    gap = compare_errors(predictions(first), predictions(second), rng=rng)
-    assert gap is not None
+    gap = there(compare_errors(predictions(first), predictions(second), rng=rng))
     assert gap.estimate == pytest.approx(np.mean(first**2) - np.mean(second**2))
     assert gap.units == 8
 
 
 def test_rows_are_matched_whatever_their_order_and_other_frames_are_not_compared(rng):
     error = rng.normal(size=(8, 5))
-    gap = compare_errors(predictions(error), predictions(error, order=rng.permutation(40)), rng=rng)
-    assert gap is not None
+    gap = there(compare_errors(predictions(error), predictions(error, order=rng.permutation(40)), rng=rng))
     assert (gap.low, gap.estimate, gap.high) == (0, 0, 0)
     assert compare_errors(predictions(error), predictions(error[:7]), rng=rng) is None

@@ -7,10 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sliplens.errors import ContactError
 from sliplens.mechanics import stick_ratio
 from sliplens.recordings import ContactState
-from sliplens.simulation.loading import load_at_margins, load_grasp, slide
+from sliplens.simulation.loading import load_grasp, slide
 from sliplens.simulation.nuisances import Grasp, Nuisances, draw_day, draw_grasp
 
 FRAMES = 800
@@ -147,15 +146,3 @@ def test_a_release_ends_without_contact_and_slides_on_the_way(seed):
     falling = np.flatnonzero(np.diff(loading.normal_force_n) < -1e-3 * loading.normal_force_n.max())
     assert falling.size
     assert np.all(np.nan_to_num(loading.safety_margin[falling + 1], nan=0.0) == 0)
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: load_at_margins(np.array([0.5]), grasp=Grasp(friction=0.0)), "coefficient of friction must be pos"),
-        (lambda: load_at_margins(np.array([0.5]), grasp=Grasp(normal_force_n=-1.0)), "normal force must not be neg"),
-    ],
-)
-def test_impossible_loads_are_refused(call, message):
-    with pytest.raises(ContactError, match=message):
-        call()

@@ -25,7 +25,6 @@ from sliplens.results.explanation import Explanation, MethodNotes
 from sliplens.results.study import Truth
 from sliplens.simulation import CHROMATOUCH, SimulationRecipe
 from sliplens.simulation.trials import put_markers_back, visible_markers
-from sliplens.study.choice import marker_sums
 from sliplens.study.truth import (
     FrameEffects,
     JudgingByTruth,
@@ -369,10 +368,3 @@ def test_markers_move_to_a_frame_before_the_first_slip():
     assert neutral_frame(margins, 7) == 2
     assert neutral_frame(margins, 1) == 4  # too near to .85 itself
     assert neutral_frame(margins, 2) == 4
-
-
-def test_relevance_is_summed_by_marker():
-    regions = np.array([[0, 0, 2], [1, 2, 1], [2, 2, 2]])
-    relevance = np.array([[1.0, 2.0, 8.0], [4.0, 8.0, -1.0], [8.0, 8.0, 8.0]])
-    sums = marker_sums(relevance, regions, markers=2)
-    np.testing.assert_array_equal(sums, [3.0, 3.0])

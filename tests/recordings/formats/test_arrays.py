@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from own_recording import write_forces
 from readers import read_arrays, refused
+from there import there
 
 from sliplens.images import write_png
 from sliplens.recordings import Dataset, ReadOptions, Recording, import_recordings
@@ -60,10 +61,8 @@ def test_arrays_give_the_data_set_of_images_and_a_table(trials: dict[str, Record
         np.testing.assert_array_equal(getattr(actual, field), getattr(expected, field))
     assert actual.trial == expected.trial
     assert first.trials[0].forces_sha256 != ""
-    forces = [data.open(data.trials[0]).forces for data in (first, second)]
-    assert forces[0] is not None
-    assert forces[1] is not None
-    np.testing.assert_array_equal(forces[1].force_n, forces[0].force_n)
+    forces = [there(data.open(data.trials[0]).forces).force_n for data in (first, second)]
+    np.testing.assert_array_equal(forces[1], forces[0])
 
 
 @pytest.mark.parametrize("name", ["a.npz", "a.h5"])
@@ -72,17 +71,15 @@ def test_names_and_units_are_those_of_tables(tmp_path: Path, arrays: Arrays, nam
     frames = np.asfortranarray(arrays["frames"])  # as a transposed array is stored
     plain = {"frames": frames, "t [ms]": 1000 * arrays["time_s"], "reference": frames[2]}
     capture = read_arrays(write(tmp_path / name, plain | {"force_mn": 1000 * force, "ids": np.arange(3)}))
-    assert capture.forces is not None
     np.testing.assert_array_equal(list(capture.read_frames()), arrays["frames"])
     np.testing.assert_array_equal(capture.reference, arrays["frames"][2])
     np.testing.assert_allclose(capture.frame_time_s, arrays["time_s"])
-    np.testing.assert_array_equal(capture.forces.time_s, capture.frame_time_s)
-    np.testing.assert_allclose(capture.forces.force_n, force)
+    np.testing.assert_array_equal(there(capture.forces).time_s, capture.frame_time_s)
+    np.testing.assert_allclose(there(capture.forces).force_n, force)
     capture = read_arrays(
         write(tmp_path / f"b{name}", plain | {"normal": force[:, 2], "ft": force[:, 0]}), frame_rate=5.0
     )
-    assert capture.forces is not None
-    np.testing.assert_allclose(capture.forces.force_n[:, [2, 0]], force[:, [2, 0]])
+    np.testing.assert_allclose(there(capture.forces).force_n[:, [2, 0]], force[:, [2, 0]])
     np.testing.assert_allclose(capture.frame_time_s, np.arange(COUNT) / 5)
 
 

@@ -109,22 +109,10 @@ def test_clocks_of_another_zero_are_refused(trial: Trial, rng: np.random.Generat
         estimate_lag(trial.frame_time_s, trial.motion, forces, rng=rng)
 
 
-@pytest.mark.parametrize(
-    ("speed", "late_s"),
-    [
-        (25 / 30, 0),
-        (0.8, 0),
-        (1.25, 0),
-        (0.9, 0),
-        (1.1, 0),
-        (1, 0.1),
-        (1, -0.1),
-        (1, 0.3),
-        (1, -0.5),
-        (1, 1.5),
-        (1, -1.5),
-    ],
-)
+SPEEDS, LATE_S = (25 / 30, 0.8, 1.25, 0.9, 1.1), (0.1, -0.1, 0.3, -0.5, 1.5, -1.5)
+
+
+@pytest.mark.parametrize(("speed", "late_s"), [*((speed, 0) for speed in SPEEDS), *((1, late_s) for late_s in LATE_S)])
 def test_labels_by_another_clock_are_doubted_and_none_is_valid(trial: Trial, speed: float, late_s: float):
     forces = trial.forces(noise_n=0.02, rng=seed(), tare_n=(1.0, 2.0, -1.0))
     wrong = replace(trial, frame_time_s=trial.frame_time_s * speed + late_s, motion=frames_of(trial))
