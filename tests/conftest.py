@@ -3,7 +3,6 @@
 import os
 import pickle
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 from data_sets import save_dataset
@@ -13,7 +12,6 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import numpy as np
 import pytest
-from dots import draw_dots, make_grid
 from hypothesis import settings
 from small import TRACTION, make_recording, save_untrained
 
@@ -164,13 +162,3 @@ def trials() -> dict[str, Recording]:
         )
         for sensor in (CHROMATOUCH, FLAT_GEL)
     }
-
-
-@pytest.fixture
-def dots() -> Callable[..., np.ndarray]:
-    return draw_dots
-
-
-@pytest.fixture
-def grid() -> Callable[..., np.ndarray]:
-    return make_grid

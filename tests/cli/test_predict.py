@@ -6,7 +6,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 from command_line import table_cells, typed
-from own_recording import write_video
+from own_recording import write_images, write_video
 from pyarrow.csv import read_csv
 
 from sliplens import __version__
@@ -89,9 +89,7 @@ def test_what_is_withheld_has_no_margin_on_the_terminal(
 ):
     trial = trials["flat-gel"]
     write_png(tmp_path / "untouched.png", trial.reference)
-    (tmp_path / "frames").mkdir()
-    for at, frame in enumerate(trial.frames[shown]):
-        write_png(tmp_path / "frames" / f"{at:02}.png", frame)
+    write_images(tmp_path / "frames", trial.frames[shown], "{:02}.png")
     options = ("--reference", tmp_path / "untouched.png", "-o", tmp_path / "a.csv")
     run("chromatouch-difference", tmp_path / "frames", *options)
     lines = capsys.readouterr().out.splitlines()

@@ -3,6 +3,8 @@ import pyarrow.parquet as pq
 import pytest
 from command_line import typed
 from data_sets import save_dataset
+from dots import draw_dots, make_grid
+from own_recording import write_images
 
 from sliplens.images import write_png
 from sliplens.markers import track_markers
@@ -12,20 +14,16 @@ pytest.importorskip("cv2", reason="markers are found with OpenCV, of the extra `
 
 
 @pytest.fixture
-def moving(dots, grid, rng):
+def moving(rng):
     """A reference and four frames in which a printed grid moves by 0.5 px each."""
-    places = grid(jitter=0.5, rng=rng)
-    return dots(places), [dots(places + np.array([0.5 * step, 0.0])) for step in range(1, 5)]
+    places = make_grid(jitter=0.5, rng=rng)
+    return draw_dots(places), [draw_dots(places + np.array([0.5 * step, 0.0])) for step in range(1, 5)]
 
 
 @pytest.fixture
 def folder(tmp_path, moving):
-    path = tmp_path / "frames"
-    path.mkdir()
-    for number, frame in enumerate(moving[1]):
-        write_png(path / f"frame{number}.png", frame)
     write_png(tmp_path / "untouched.png", moving[0])
-    return path
+    return write_images(tmp_path / "frames", moving[1])
 
 
 def test_a_folder_of_images_becomes_a_table_of_displacements(folder, tmp_path):

@@ -25,14 +25,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from data_sets import save_dataset
 from made_up import write_workspace
-from own_recording import write_video
+from own_recording import write_images, write_video
 from PIL import Image
 from ros_bags import CAMERA, FORCE, frame_ns, raw_image, wrench, wrench_ns, write_bag
 from small import make_recording, save_untrained
 
 from sliplens.errors import SliplensError
 from sliplens.files import hash_file, scratch_folder
-from sliplens.images import write_png
 from sliplens.models import predict
 from sliplens.recordings import import_recordings, label_dataset, load_dataset
 from sliplens.recordings.capture import Forces
@@ -302,9 +301,7 @@ def _labels(folder: Path) -> object:
 def _own(folder: Path) -> None:
     """A folder of images with forces and times beside it, and a manifest."""
     trial = make_recording("cup", frames=60)
-    (folder / "cup").mkdir()
-    for index, frame in enumerate(trial.frames):
-        write_png(folder / "cup" / f"{index:03d}.png", frame)
+    write_images(folder / "cup", trial.frames, "{:03d}.png")
     rng = np.random.default_rng(0)
     time = np.arange(0, 2, 0.002)
     normal = 5 * np.clip((time - 0.3) / 0.2, 0, 1)

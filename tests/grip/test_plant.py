@@ -29,11 +29,11 @@ def world(count: int = 1, *, mass_kg: float = 0.06, friction: float = 0.6, pull_
     )
 
 
-def held_in_air(*, force_n: float, height_m: float = 1.0, episodes: int = 1, substeps: int = 16) -> Plant:
+def held_in_air(*, force_n: float, episodes: int = 1, substeps: int = 16) -> Plant:
     """Plant whose object hangs in the air between fingers that press already, all springs at rest."""
     plant, full = Plant(CUP, episodes=episodes, substeps=substeps), np.ones(episodes)
-    anchor = np.full((episodes, 2), -height_m)  # the hand is at 0, and stays there for 0.5 s
-    plant.state = replace(plant.state, force_n=force_n * full, height_m=height_m * full, anchor_m=anchor)
+    anchor = np.full((episodes, 2), -1.0)  # the hand is at 0, and stays there for 0.5 s
+    plant.state = replace(plant.state, force_n=force_n * full, height_m=full, anchor_m=anchor)
     return plant
 
 

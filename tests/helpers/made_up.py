@@ -17,6 +17,7 @@ from sliplens.results.evaluation import Evaluation, LearningCurve, ScoredFrames,
 from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes
 from sliplens.training.evaluation import lead_times, regression_scores, risk_coverage
 
+SIZE = 24
 METHODS = ("grad-cam", "integrated-gradients", "poly-cam")
 MARGINS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
 NOISE = {("raw", "dry"): 0.14, ("raw", "wet"): 0.24, ("difference", "dry"): 0.09, ("difference", "wet"): 0.17}
@@ -49,14 +50,14 @@ def write_simulation(workspace: Path) -> Path:
     return folder
 
 
-def write_training(workspace: Path, name: str, *, size: int, rng: np.random.Generator) -> Path:
+def write_training(workspace: Path, name: str, *, rng: np.random.Generator) -> Path:
     epochs = np.arange(12.0)
     floor = 0.02 if name == "raw" else 0.011
     validation = floor + 0.08 * np.exp(-epochs / 2.5) * rng.uniform(0.9, 1.1, 12)
     result = Training(
         input=name,
         backbone="shufflenet_v2_x1_0",
-        image_size=size,
+        image_size=SIZE,
         frame_size=(224, 224),
         train_frames=1600,
         validation_frames=320,
@@ -72,30 +73,7 @@ def write_training(workspace: Path, name: str, *, size: int, rng: np.random.Gene
     return write_run(workspace / f"network-{name}", "train", config, result, minute=5)
 
 
-def made_up_evaluation(predictions: ScoredFrames, *, name: str = "difference", sure: bool = False) -> Evaluation:
-    """Scores of some predictions, coverage apart, which is made up too."""
-    by_condition = {
-        one: predictions.where(predictions.condition == one) for one in np.unique(predictions.condition).tolist()
-    }
-    by_trial = {one: predictions.where(predictions.trial == one) for one in np.unique(predictions.trial).tolist()}
-    return Evaluation(
-        input=name,
-        split="test",
-        known_trials=0,
-        conditions={one: regression_scores(rows) for one, rows in by_condition.items()},
-        trials={one: regression_scores(rows) for one, rows in by_trial.items()},
-        coverage={one: {"0.5": 0.48, "0.9": 0.88 if one == "dry" else 0.6} if sure else {} for one in by_condition},
-        lead_times={one: lead_times(rows) for one, rows in by_condition.items()},
-        predictions=predictions,
-        risk=risk_coverage(
-            np.abs(predictions.prediction - predictions.safety_margin), {"spread": -predictions.sigma if sure else None}
-        ),
-    )
-
-
-def write_evaluation(
-    workspace: Path, name: str, *, trials: int, rng: np.random.Generator, trial_name: str = "day4-{}-{:03d}"
-) -> Path:
+def write_evaluation(workspace: Path, name: str, *, trials: int, rng: np.random.Generator) -> Path:
     time = np.linspace(0, 2, 40)
     trial, condition, labels, answers = [], [], [], []
     for surface in ("dry", "wet"):
@@ -103,7 +81,7 @@ def write_evaluation(
             # one law for both inputs: the labels of a test frame do not depend on the network
             label = np.clip(1.02 - time / (1.5 + 0.05 * number), 0, 1)
             noise = NOISE[name, surface] * (rng.normal() * 0.5 + rng.normal(size=40) * 0.8)
-            trial += [trial_name.format(surface, number)] * 40
+            trial += [f"day4-{surface}-{number:03d}"] * 40
             condition += [surface] * 40
             labels.append(label)
             answers.append(label + noise + 0.05 * (1 - label))
@@ -118,17 +96,27 @@ def write_evaluation(
         **{column: np.full(len(trial), np.nan) for column in ("sigma", "low_90", "high_90")},
         withheld=np.full(len(trial), ""),
     )
-    result = made_up_evaluation(predictions, name=name)
+    by_condition = {one: predictions.where(predictions.condition == one) for one in ("dry", "wet")}
+    by_trial = {one: predictions.where(predictions.trial == one) for one in dict.fromkeys(trial)}
+    result = Evaluation(
+        input=name,
+        split="test",
+        known_trials=0,
+        conditions={one: regression_scores(rows) for one, rows in by_condition.items()},
+        trials={one: regression_scores(rows) for one, rows in by_trial.items()},
+        coverage={one: {} for one in by_condition},
+        lead_times={one: lead_times(rows) for one, rows in by_condition.items()},
+        predictions=predictions,
+        risk=risk_coverage(np.abs(predictions.prediction - predictions.safety_margin), {"spread": None}),
+    )
     return write_run(workspace / f"test-{name}", "evaluate", {"input": name}, result, minute=9)
 
 
-def picture_and_maps(
-    margin: float, name: str, *, size: int, rng: np.random.Generator
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def picture_and_maps(margin: float, name: str, rng: np.random.Generator) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """A dome of dark markers that move down as the margin falls, and a map of each kind on its lower markers."""
-    y, x = np.mgrid[:size, :size] / size
+    y, x = np.mgrid[:SIZE, :SIZE] / SIZE
     light = 0.75 - 0.6 * ((x - 0.5) ** 2 + (y - 0.5) ** 2)
-    now, still, moved = np.zeros((3, size, size))
+    now, still, moved = np.zeros((3, SIZE, SIZE))
     for row in np.linspace(0.14, 0.86, 6):
         for column in np.linspace(0.14, 0.86, 6):
             reach = np.exp(-8 * ((row - 0.55) ** 2 + (column - 0.5) ** 2))
@@ -143,20 +131,20 @@ def picture_and_maps(
     blob = np.exp(-((x - 0.5) ** 2 + (y - 0.6) ** 2) / 0.06)
     maps = {
         "grad-cam": blob,
-        "integrated-gradients": moved * rng.random((size, size)) + 0.15 * rng.random((size, size)),
+        "integrated-gradients": moved * rng.random((SIZE, SIZE)) + 0.15 * rng.random((SIZE, SIZE)),
         "poly-cam": moved,
     }
     return (255 * image).astype(np.uint8), {key: (one - one.min()) / np.ptp(one) for key, one in maps.items()}
 
 
 def frames_named(
-    ids: Sequence[str], margins: Sequence[float | None], predictions: Sequence[float], *, condition: str = "dry"
+    ids: Sequence[str], margins: Sequence[float | None], predictions: Sequence[float]
 ) -> tuple[ExplainedFrame, ...]:
     return tuple(
         ExplainedFrame(
             id=frame_id,
             trial=frame_id.rpartition("-")[0] or frame_id,
-            condition=condition,
+            condition="dry",
             safety_margin=margin,
             prediction=prediction,
             reference_prediction=1.0,
@@ -165,9 +153,7 @@ def frames_named(
     )
 
 
-def write_explanation(
-    workspace: Path, name: str, source: str, *, size: int, rng: np.random.Generator, condition: str = "dry"
-) -> Path:
+def write_explanation(workspace: Path, name: str, source: str, *, rng: np.random.Generator) -> Path:
     noise = 0.03 if source == "simulated" else 0.2
     margins = [margin for margin in MARGINS for _ in range(2 if source == "simulated" else 1)]
     ids = [
@@ -175,10 +161,10 @@ def write_explanation(
         for place, m in enumerate(margins)
     ]
     predictions = [float(np.clip(margin + rng.normal(0, noise), 0, 1.05)) for margin in margins]
-    frames = frames_named(ids, margins, predictions, condition=condition)
+    frames = frames_named(ids, margins, predictions)
     seconds = {"grad-cam": 0.031, "integrated-gradients": 0.42, "poly-cam": 3.1}
     warned = {"integrated-gradients": ("completeness gap 1.8 % on 2 frames",) * (name == "raw" and source == "real")}
-    drawn = [picture_and_maps(margin, name, size=size, rng=rng) for margin in margins]
+    drawn = [picture_and_maps(margin, name, rng) for margin in margins]
     saliency = {key: np.stack([maps[key] for _, maps in drawn]).astype(np.float32) for key in METHODS}
     return write_run(
         workspace / f"maps-{name}-{source}",
@@ -220,32 +206,32 @@ def explained(
     )
 
 
-def write_score(workspace: Path, name: str, *, size: int, rng: np.random.Generator) -> Path:
+def write_score(workspace: Path, name: str, *, rng: np.random.Generator) -> Path:
     frames = frames_named([f"f{number:03d}" for number in range(12)], [None] * 12, [0.0] * 12)
-    last, removed = 0.25 if name == "difference" else 0.45, np.arange(1, size + 1) / size
+    last, removed = 0.25 if name == "difference" else 0.45, np.arange(1, SIZE + 1) / SIZE
     answers = {}
     for method, fall in FALL.items():
-        answers[method] = np.zeros((len(frames), size + 1))
+        answers[method] = np.zeros((len(frames), SIZE + 1))
         for row in answers[method]:
             rate = fall * rng.uniform(0.7, 1.3) * (1 if name == "difference" else 2)
             fallen = (1 - np.exp(-removed / rate)) / (1 - np.exp(-1 / rate))
-            score = np.clip(1 - (1 - last) * fallen + 0.01 * rng.normal(size=size) * (fallen < 1), 0, 1)
+            score = np.clip(1 - (1 - last) * fallen + 0.01 * rng.normal(size=SIZE) * (fallen < 1), 0, 1)
             row[1:] = 1 - np.sqrt(score)
-    pictures = np.zeros((len(frames), size, size, 3), dtype=np.uint8)
+    pictures = np.zeros((len(frames), SIZE, SIZE, 3), dtype=np.uint8)
     scores = score_deletion(explained(name, frames, {}, pictures, {}), answers, fill="grey")
     alarms = ("on 3 frames the filled image is answered like the frame itself",) if name == "raw" else ()
     config = {"input": name, "fill": "grey"}
     return write_run(workspace / f"score-{name}", "score", config, replace(scores, alarms=alarms), minute=20)
 
 
-def write_workspace(workspace: Path, *, size: int = 24, trials: int = 6, seed: int = 20261121) -> Path:
+def write_workspace(workspace: Path, *, trials: int = 6) -> Path:
     """Every stage, for both inputs."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(20261121)
     write_simulation(workspace)
     for name in ("raw", "difference"):
-        write_training(workspace, name, size=size, rng=rng)
+        write_training(workspace, name, rng=rng)
         write_evaluation(workspace, name, trials=trials, rng=rng)
         for source in ("simulated", "real"):
-            write_explanation(workspace, name, source, size=size, rng=rng)
-        write_score(workspace, name, size=size, rng=rng)
+            write_explanation(workspace, name, source, rng=rng)
+        write_score(workspace, name, rng=rng)
     return workspace

@@ -1,13 +1,14 @@
 """A recording as a user brings it: a video of the frames, and a table of what a force sensor saw."""
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
 
 import av
 import numpy as np
 
+from sliplens.images import write_png
 from sliplens.recordings import Recording
 
 _FORCE_RATE = 500
@@ -44,7 +45,6 @@ def write_frames(
     stamps_ms: list[int] | None = None,
     reordered: int = 0,
     title: str = "",
-    options: dict[str, str] | None = None,
 ) -> Path:
     """Frames at a rate, or at milliseconds as they are given; `reordered` B-frames in a row."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -52,14 +52,13 @@ def write_frames(
     faststart = {"movflags": "faststart"} if path.suffix == ".mp4" else {}
     with av.open(str(path), "w", options=faststart) as container:
         container.metadata["title"] = title
-        stream = container.add_stream(codec, rate=rate, options=options or {})
+        stream = container.add_stream(codec, rate=rate)
         assert isinstance(stream, av.VideoStream)
-        stream.height, stream.width = frames[0].shape[:2] if len(frames) else (64, 96)
+        stream.height, stream.width = frames[0].shape[:2]
         stream.pix_fmt = pixels
-        if options is None:
-            stream.codec_context.max_b_frames = reordered
-            stream.codec_context.gop_size = 12
-            stream.codec_context.bit_rate = 4_000_000
+        stream.codec_context.max_b_frames = reordered
+        stream.codec_context.gop_size = 12
+        stream.codec_context.bit_rate = 4_000_000
         if codec == "libx264":
             # keep the B-frames that were asked for
             stream.options = {"b-adapt": "0", "threads": "1"}
@@ -69,8 +68,13 @@ def write_frames(
             frame = av.VideoFrame.from_ndarray(pixel, format="rgb24")
             frame.pts, frame.time_base = index if stamps_ms is None else stamps_ms[index], tick
             container.mux(stream.encode(frame))
-        if len(frames):
-            container.mux(stream.encode())
-        else:
-            container.start_encoding()
+        container.mux(stream.encode())
     return path
+
+
+def write_images(folder: Path, frames: Iterable[np.ndarray], name: str = "{}.png") -> Path:
+    """Frames as images of a folder, named by their numbers."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, frame in enumerate(frames):
+        write_png(folder / name.format(number), frame)
+    return folder

@@ -2,6 +2,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from dots import draw_dots, make_grid
 from scipy.ndimage import gaussian_filter
 
 from sliplens.errors import ImageError, InputError
@@ -26,9 +27,9 @@ def nearest(found, places):
         ("auto", {"background": (120, 120, 120), "marker": (180, 60, 120)}),
     ],
 )
-def test_every_contrast_is_found_and_measured(kind, colours, dots, grid, rng):
-    places = grid(jitter=0.5, rng=rng)
-    found = detect_markers(dots(places, **colours, noise=3.0, rng=rng), kind)
+def test_every_contrast_is_found_and_measured(kind, colours, rng):
+    places = make_grid(jitter=0.5, rng=rng)
+    found = detect_markers(draw_dots(places, **colours, noise=3.0, rng=rng), kind)
     assert len(found) == len(places)
     error = found.centre_px[nearest(found.centre_px, places)] - places
     assert np.sqrt(np.mean(error**2)) < 0.06
@@ -50,9 +51,9 @@ def test_simulated_centres_are_within_the_goal_and_none_is_missed_or_invented(na
     assert np.sqrt(np.mean(np.concatenate(errors) ** 2)) < 0.15
 
 
-def test_a_frame_without_markers_is_answered_with_none_once_their_look_is_known(dots, grid):
-    appearance = detect_markers(dots(grid()), "gelsight-mini").appearance
-    assert len(detect_markers(dots(np.zeros((0, 2))), appearance=appearance)) == 0
+def test_a_frame_without_markers_is_answered_with_none_once_their_look_is_known():
+    appearance = detect_markers(draw_dots(make_grid()), "gelsight-mini").appearance
+    assert len(detect_markers(draw_dots(np.zeros((0, 2))), appearance=appearance)) == 0
 
 
 @pytest.mark.parametrize(
@@ -107,12 +108,12 @@ def test_a_picture_without_dots_has_no_markers(name: str, seed: int):
         detect_markers(PICTURES[name](np.random.default_rng(seed)), "auto")
 
 
-def test_dots_that_lie_anywhere_are_markers_if_they_are_alike(dots, rng):
+def test_dots_that_lie_anywhere_are_markers_if_they_are_alike(rng):
     grid = rng.permutation(49)[:20]  # of a fine grid, so that none touches another
     places = np.stack([20 + 26.0 * (grid % 7), 20 + 26.0 * (grid // 7)], axis=-1) + rng.uniform(-6, 6, (20, 2))
-    assert len(detect_markers(dots(places, size=(200, 200)), "auto")) == 20
+    assert len(detect_markers(draw_dots(places, size=(200, 200)), "auto")) == 20
 
 
-def test_an_unknown_kind_is_refused(dots, grid):
+def test_an_unknown_kind_is_refused():
     with pytest.raises(InputError, match="choose one of chromatouch, gelsight-mini, tactip, auto"):
-        detect_markers(dots(grid()), "digit")
+        detect_markers(draw_dots(make_grid()), "digit")

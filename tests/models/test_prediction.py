@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from own_recording import write_images
 
 import sliplens as sl
 from sliplens.codec import TABLE_SUFFIXES
@@ -52,13 +53,6 @@ def predict(source: Path, trained: Network, path: Path, *, batch_size: int = 5, 
 def one_by_one(trained: Network, frames: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """The slow way: each frame by itself."""
     return np.array([trained.estimate(trained.encode(frame[None], reference)).margin[0] for frame in frames])
-
-
-def write_frames(folder: Path, frames: np.ndarray) -> Path:
-    folder.mkdir()
-    for index, frame in enumerate(frames):
-        write_png(folder / f"frame{index}.png", frame)  # frame10 after frame9, not after frame1
-    return folder
 
 
 def test_a_data_set_is_predicted_frame_by_frame(
@@ -110,8 +104,8 @@ def test_the_lowest_margin_is_of_a_frame_that_touches(trained: Network, wet: Rec
 
 
 def test_a_folder_of_frames_and_its_differences_are_the_same(trained: Network, wet: Recording, tmp_path: Path):
-    frames = write_frames(tmp_path / "frames", wet.frames)
-    compared = write_frames(tmp_path / "compared", absolute_difference(wet.frames, wet.reference))
+    frames = write_images(tmp_path / "frames", wet.frames, "frame{}.png")  # frame10 after frame9, not after frame1
+    compared = write_images(tmp_path / "compared", absolute_difference(wet.frames, wet.reference))
     write_png(tmp_path / "untouched.png", wet.reference)
     first = predict(frames, trained, tmp_path / "a.parquet", reference=tmp_path / "untouched.png")
     second = predict(compared, trained, tmp_path / "b.parquet")
@@ -131,9 +125,9 @@ def test_what_is_missing_or_too_much_is_refused(
     trained: Network, small_dataset: Dataset, wet: Recording, tmp_path: Path
 ):
     image, data = tmp_path / "untouched.png", small_dataset.folder
-    folder = write_frames(tmp_path / "frames", wet.frames)
+    folder = write_images(tmp_path / "frames", wet.frames)
     write_png(image, wet.reference)
-    small = write_frames(tmp_path / "small", np.ascontiguousarray(wet.frames[:, :40]))
+    small = write_images(tmp_path / "small", np.ascontiguousarray(wet.frames[:, :40]))
     refused(folder, trained, InputError, "named twice", reference=image, reference_frame=0)
     refused(data, trained, InputError, "bring their reference frames", reference=image)
     refused(small, trained, ImageError, "40 x 48 pixels", reference_frame=0, out=tmp_path / "a.parquet")

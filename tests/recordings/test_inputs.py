@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from own_recording import write_images
 
 import sliplens as sl
 from sliplens.errors import InputError
@@ -31,9 +32,7 @@ def write(path: Path, frames: np.ndarray) -> Path:
     elif path.suffix == ".png":
         write_png(path, frames[1])
     else:
-        path.mkdir()
-        for number, frame in enumerate(frames):
-            write_png(path / f"{number}.png", frame)
+        write_images(path, frames)
     return path
 
 

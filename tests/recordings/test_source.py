@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from own_recording import write_images
 from there import there
 
 from sliplens.errors import ImageError, InputError
-from sliplens.images import write_png
 from sliplens.recordings import Dataset
 from sliplens.recordings.formats import ReadOptions
 from sliplens.recordings.source import open_source
@@ -15,10 +15,7 @@ from sliplens.recordings.source import open_source
 def folder(tmp_path, rng):
     """Three images and what they show."""
     frames = rng.integers(0, 256, (3, 24, 32, 3), dtype=np.uint8)
-    (tmp_path / "frames").mkdir()
-    for number, frame in enumerate(frames):
-        write_png(tmp_path / "frames" / f"f{number}.png", frame)
-    return tmp_path / "frames", frames
+    return write_images(tmp_path / "frames", frames), frames
 
 
 def test_a_folder_and_an_array_give_the_same_frames(folder):

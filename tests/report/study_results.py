@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from made_up import explained, frames_named, picture_and_maps, write_evaluation, write_run
+from made_up import SIZE, explained, frames_named, picture_and_maps, write_evaluation, write_run
 
 from sliplens.faithfulness.scoring import frame_columns, score_curves, score_deletion
 from sliplens.intervals import Difference
@@ -22,7 +22,6 @@ CONTROLS = ("edges", "centre")
 FILLS = (("reference", "pixel"), ("grey", "pixel"), ("blur", "pixel"), ("reference", "marker"), ("true", "marker"))
 LEVELS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
 SCORED = (0.4, 0.2, 0.0)
-SIZE = 24
 GRID = SIZE * np.stack([axis.ravel() for axis in np.meshgrid(*[np.linspace(0.14, 0.86, 6)] * 2)])
 """Markers, x and y."""
 GAINS = {"grad-cam": -0.05, "integrated-gradients": 0.06, "poly-cam": 0.16, "edges": 0.02, "centre": 0.01}
@@ -88,10 +87,10 @@ def scored_frames(made: Made) -> list[records.ChosenFrame]:
     return [frame for frame in frames_of(made) if frame.scored]
 
 
-def write_study(workspace: Path, made: Made | None = None, *, seed: int = 7) -> Path:
+def write_study(workspace: Path, made: Made | None = None) -> Path:
     """Every stage of a study."""
     made = made or Made()
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(7)
     write_choice(workspace, made)
     write_states(workspace, made)
     for name in made.inputs:
@@ -159,7 +158,7 @@ def without_maps(name: str, rows: Sequence[records.ChosenFrame]) -> Explanation:
 
 def write_maps(workspace: Path, name: str, made: Made, *, rng: np.random.Generator) -> None:
     rows = frames_of(made)
-    drawn = [picture_and_maps(row.safety_margin, name, size=SIZE, rng=rng) for row in rows]
+    drawn = [picture_and_maps(row.safety_margin, name, rng) for row in rows]
     stacked = {
         method + made.as_run: np.stack([maps[method] for _, maps in drawn]).astype(np.float32) for method in METHODS
     }

@@ -50,11 +50,11 @@ def test_edges_of_bins_belong_to_the_bin_above_and_one_to_the_last():
     assert scores.bins[2].mse is None
 
 
-def trial(seconds: float = 10.0) -> tuple[np.ndarray, np.ndarray]:
-    """A margin that falls evenly to 0 at `seconds` and stays there for a second, 10 frames a second."""
-    time = np.arange(0, seconds + 1.05, 0.1)
+def trial() -> tuple[np.ndarray, np.ndarray]:
+    """A margin that falls evenly to 0 at 10 s and stays there for a second, 10 frames a second."""
+    time = np.arange(0, 11.05, 0.1)
     # rounded: 1 - 0.8 is not 0.2 in binary, and a threshold would tell them apart
-    return time, np.clip(1 - time / seconds, 0, 1).round(6)
+    return time, np.clip(1 - time / 10, 0, 1).round(6)
 
 
 def test_a_perfect_network_warns_as_early_as_the_margin_itself():

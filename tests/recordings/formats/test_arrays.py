@@ -4,11 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from own_recording import write_forces
+from own_recording import write_forces, write_images
 from readers import read_arrays, refused
 from there import there
 
-from sliplens.images import write_png
 from sliplens.recordings import Dataset, ReadOptions, Recording, import_recordings
 
 COUNT = 6
@@ -38,9 +37,7 @@ def write(path: Path, arrays: Arrays) -> Path:
 @pytest.mark.parametrize("name", ["a.npz", "a.h5"])
 def test_arrays_give_the_data_set_of_images_and_a_table(trials: dict[str, Recording], tmp_path: Path, name: str):
     trial = trials["chromatouch"]
-    (tmp_path / "a").mkdir()
-    for number, frame in enumerate(trial.frames):
-        write_png(tmp_path / "a" / f"{number}.png", frame)
+    write_images(tmp_path / "a", trial.frames)
     table = write_forces(trial, tmp_path / "forces.csv")
     time_s, *force = np.loadtxt(table, delimiter=",", skiprows=1).T
     times_ms = 1000 * (time_s[0] + np.arange(len(trial)) / 30)
