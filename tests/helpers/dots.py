@@ -7,7 +7,7 @@ def draw_dots(
     centres,
     *,
     size=(160, 200),
-    radius=5.0,
+    radius: float | np.ndarray = 5.0,
     edge=0.6,
     background=(180, 170, 160),
     marker=(30, 25, 20),
