@@ -52,8 +52,7 @@ _PATIENCE_S = 10.0  # with a thread that is to end
 _UNANSWERED = 2  # messages under way to one client: one is drawn while the next one travels
 _KEEP_ALIVE_S = 1.0  # the page takes a longer silence for a lost connection
 _RATE_S = 2.0
-_LARGEST = {"press_n": 3.0, "pull_n": 2.4, "water_kg": 0.06, "grip_pull_n": 0.6}
-"""Ends of the sliders."""
+_LARGEST = {"press_n": 3.0, "pull_n": 2.4, "water_kg": 0.06, "grip_pull_n": 0.6}  # ends of the sliders
 _STILL = "waiting for a still picture: leave the sensor untouched"
 _Source = TypeVar("_Source", bound=LiveSource)
 
@@ -132,8 +131,7 @@ class Feed:
         self.ended: str | None = None
         """Why no more readings come; None while they may."""
         self._points: list[Point] = []
-        self._newest: PageFrame | None = None
-        """Newest frame; a picture once it is drawn."""
+        self._newest: PageFrame | None = None  # newest frame; a picture once it is drawn
         self._start: LiveFrame | None = None
         self._largest = 0.0
         self._closed = Event()
@@ -296,8 +294,7 @@ class Client:
         self.explained: Map | None = None
         """Map of the frozen picture."""
         self.shows_map = True
-        self._waiting = ""
-        """Work in progress for this client, in words."""
+        self._waiting = ""  # work in progress for this client, in words
         self._notices: deque[str] = deque(maxlen=4)
         self._running: dict[str, asyncio.Task[None]] = {}
         self._changed = asyncio.Event()
@@ -432,14 +429,12 @@ class Client:
         has_margin = feed.reading is not None and feed.reading.margin is not None
         overlay = self.explained if self.frozen is not None else feed.map if has_margin else None
         overlay = overlay if self.shows_map else None
-        drawn = frozen = recording = None
+        drawn = frozen = None
         if picture is not None and picture is not self._picture:
             height, width = picture.frame.size
             drawn = {"width": width, "height": height, "arrows": picture.arrows, "jpeg": picture.jpeg}
         if self.frozen is not None:
             frozen = f"frame {self.frozen.frame.number}, {describe_reading(self.frozen.reading)}"
-        if (recorder := reader.recorder) is not None:
-            recording = {"name": recorder.name, "sent": recorder.sent, "lost": recorder.lost}
         points = feed.points_since(self._sent_until_s)
         notices = [self._notices.popleft() for _ in range(len(self._notices))]
         self._serial += 1
@@ -454,7 +449,7 @@ class Client:
             "waiting": self._waiting or (_STILL if reader.taker else ""),
             "notices": notices,
             "ended": feed.ended,
-            "recording": recording,
+            "recording": reader.recorder and str(reader.recorder),
             "troubles": (*reader.doubts, *reader.troubles),
             "frozen": frozen,
             "has_map": overlay is not None,  # this one, or the one sent before

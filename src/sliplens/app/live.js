@@ -416,10 +416,7 @@ function tellFacts() {
   }
   shown.forEach((text, index) => set($.facts.children[index], text));
   $.recording.hidden = !recording;
-  if (recording) {
-    const lost = recording.lost ? `, ${recording.lost} lost` : "";
-    set($.recording, `● recording, ${recording.sent} frames${lost}: ${recording.name}`);
-  }
+  set($.recording, `● recording ${recording}`);
   set($.troubles, troubles.map((trouble) => `▲ ${trouble}`).join("\n"));
 }
 

@@ -8,7 +8,6 @@ from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import cached_property, partial
 from importlib import import_module
 from inspect import Parameter, Signature, signature
-from itertools import pairwise, takewhile
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, Union, Unpack, get_args, get_origin, get_type_hints
@@ -18,10 +17,9 @@ import docstring_parser
 
 from sliplens.cli.console import Terminal
 from sliplens.errors import InputError
-from sliplens.files import find_run, partial_folder, require_new_file
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Command:
     """A function on the command line."""
 
@@ -32,8 +30,6 @@ class Command:
     example: str
     aliases: tuple[tuple[str, str], ...] = ()
     """Parameters with a further name, such as `("source", "--from")`."""
-    suffixes: tuple[str, ...] = ()
-    """Endings of the file `out`; without an ending it is a folder."""
     writes: str = ""
     """File or folder that must be named, such as `folder of the maps`; empty where the function does without."""
 
@@ -54,40 +50,6 @@ class Command:
         """Return the further names of a parameter on the command line."""
         aliases = [alias for name, alias in self.aliases if name == parameter]
         return ["-o", "--output"] if parameter == "out" else aliases
-
-    def refuse_early(self, words: Sequence[str]) -> None:
-        """Refuse paths that cannot be read or written before the function is imported, which may take seconds."""
-        for option, out in pairwise(words):
-            if option in {"--out", *self.names_of("out")} and self.suffixes and Path(out).suffix:
-                overwrite = "--overwrite" in words or partial_folder(Path(out)).exists()
-                require_new_file(Path(out), suffix=self.suffixes, overwrite=overwrite)
-        first = list(takewhile(lambda word: not word.startswith("-"), words))
-        parameters = self.definition.args
-        typed = list(zip(parameters.args, first, strict=False))
-        if parameters.args and "Sequence[Path" in ast.unparse(parameters.args[0].annotation or ast.Constant("")):
-            typed = [(parameters.args[0], word) for word in first]
-        for parameter in (*parameters.args, *parameters.kwonlyargs):
-            options = {f"--{parameter.arg.replace('_', '-')}", *self.names_of(parameter.arg)}
-            typed += [(parameter, word) for option, word in pairwise(words) if option in options]
-        for parameter, word in typed:
-            _require_readable(parameter, word, alone=len(first) == 1)
-
-
-_NAMED = frozenset({"out", "sensor", "splits", "baseline"})
-"""Parameters that take paths to write, or names as well as paths."""
-
-
-def _require_readable(parameter: ast.arg, word: str, *, alone: bool) -> None:
-    """Refuse a word for a parameter that takes a path, by its annotation, if nothing is there."""
-    hint = "" if parameter.annotation is None else ast.unparse(parameter.annotation)
-    if parameter.arg in _NAMED or not re.search(r"\bPath\b|NetworkLike", hint) or "://" in word or Path(word).exists():
-        return
-    # `predict` may do without a network: a single word is then the source
-    if "Network" in hint and not (alone and "Images" in hint):
-        find_run(Path(word))
-    else:
-        what = "the data set " if "Dataset" in hint and "Images" not in hint else ""
-        raise InputError(f"{what}{word} does not exist; check the path")
 
 
 class _Option(NamedTuple):
@@ -114,8 +76,7 @@ def adapt(command: Command) -> tuple[Callable[..., object], list[str]]:
     def call(*positional: object, **values: object) -> None:
         values = dict(zip(names, positional, strict=False)) | values
         if command.writes and "out" not in values:
-            example = "markers.parquet" if command.suffixes else "FOLDER"
-            raise InputError(f"name the {command.writes} with -o {example}")
+            raise InputError(f"name the {command.writes} with -o; an example: {command.example}")
         others = {name: values.pop(name) for name in further.keys() & values.keys()}
         arguments: dict[str, Any] = {"on_progress": Terminal()} if "on_progress" in hints else {}
         groups: dict[str, dict[str, Any]] = {}

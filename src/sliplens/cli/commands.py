@@ -27,14 +27,12 @@ Run = Callable[..., None]
 
 
 def command(
-    name: str, function: str, example: str, *aliases: tuple[str, str], writes: str = "", suffixes: tuple[str, ...] = ()
+    name: str, function: str, example: str, *aliases: tuple[str, str], writes: str = ""
 ) -> Callable[[Run], Run]:
     """Register a function that calls a function of the library, given with its arguments, and prints the result."""
 
     def register(run: Run) -> Run:
-        COMMANDS[name] = Command(
-            function=f"sliplens.{function}", run=run, example=example, aliases=aliases, writes=writes, suffixes=suffixes
-        )
+        COMMANDS[name] = Command(f"sliplens.{function}", run, example, aliases, writes)
         return run
 
     return register
@@ -188,11 +186,7 @@ def call_sensor_new(call: Any) -> None:
 )
 def call_simulate(call: Any) -> None:
     """Print the splits."""
-    frames: dict[str, list[int]] = {}
-    for trial in call().trials:
-        frames.setdefault(trial.split, []).append(trial.frames)
-    rows = [{"split": split, "trials": len(counts), "frames": sum(counts)} for split, counts in frames.items()]
-    print_table("Simulated", rows)
+    output.show_splits(call().trials)
 
 
 @command(
@@ -209,7 +203,7 @@ def call_import(call: Any, *, audit: bool = True) -> None:
         Draw a page for each trial, in `audit/` of the folder, from which to judge its labels.
     """
     data = call()
-    output.show_labelled("Imported", data, audit=audit)
+    output.show_labelled(data, audit=audit)
     if data.left_out:
         print_table("Left out", [{"trial": trial.trial, "why": trial.why} for trial in data.left_out])
         raise SystemExit(1)
@@ -238,7 +232,7 @@ def call_label(call: Any, *, draft: Path | None = None, audit: bool = True) -> N
         draft_corrections(data, draft)
         print_file(draft, f"edit it, then: sliplens label {folder} --corrections {draft}")
         return
-    output.show_labelled("Labelled", call(data=data, out=out), audit=audit)
+    output.show_labelled(call(data=data, out=out), audit=audit)
 
 
 @command("recover", "recordings.dataset:recover_dataset", "sliplens recover runs/mine/data")
@@ -256,7 +250,8 @@ def call_split(call: Any) -> None:
     data = load_dataset(call.keywords["data"])
     result = call(data=data)
     moves = sum(info.split != split for info, split in zip(data.trials, result.splits, strict=True))
-    output.show_splits(data.trials, result.splits)
+    output.show_splits([replace(info, split=split) for info, split in zip(data.trials, result.splits, strict=True)])
+    output.show_moves(data.trials, result.splits)
     for note in result.notes:
         say(f"note: {note}")
     if call.keywords.get("dry_run"):
@@ -291,11 +286,7 @@ def call_slip(call: Any) -> None:
     """Print the balanced accuracy of the slip detector and of trivial baselines."""
     with reporting(Terminal()), open_stage("Reading clips"):
         result = call()
-    rows = [
-        {name.replace("_", " "): value if isinstance(value, str) else f"{value:.2f}" for name, value in row.items()}
-        for row in result.scores.to_arrow().select(["method", "balanced_accuracy", "low", "high"]).to_pylist()
-    ]
-    print_table(f"Slip of {number_of(len(result.fall), 'clip')}", rows)
+    print_table(f"Slip of {number_of(len(result.fall), 'clip')}", result.scores.to_arrow().to_pylist())
 
 
 @command(
@@ -319,7 +310,6 @@ def call_view(call: Any) -> None:
     "markers.tracking:track",
     "sliplens track cup.mp4 --reference untouched.png -o markers.parquet",
     writes="table to write",
-    suffixes=(".parquet",),
 )
 def call_track(call: Any) -> None:
     """Print how many markers were followed."""
@@ -375,7 +365,6 @@ def call_evaluate(call: Any, *, device: str = "cpu") -> None:
     "predict",
     "models.predictions:predict",
     "sliplens predict cup.mp4 --sensor tip.toml --plot margin.png -o margins.csv",
-    suffixes=(".parquet", ".csv"),
 )
 def call_predict(call: Any, *, plot: Path | None = None) -> None:
     """Print the margins.
@@ -407,12 +396,7 @@ def call_predict(call: Any, *, plot: Path | None = None) -> None:
         print_file(predictions.path, f"{number_of(predictions.frames, 'frame')}, by {predictions.engine}")
 
 
-@command(
-    "export onnx",
-    "models.onnx:export_onnx",
-    "sliplens export onnx runs/mine/train -o tip.onnx",
-    suffixes=(".onnx",),
-)
+@command("export onnx", "models.onnx:export_onnx", "sliplens export onnx runs/mine/train -o tip.onnx")
 def call_export_onnx(call: Any) -> None:
     """Print what was written."""
     with OUT.status("Exporting; the file appears once ONNX Runtime predicts the same as the network"):

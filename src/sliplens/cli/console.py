@@ -96,14 +96,17 @@ class Terminal:
         self._notes.clear()
 
 
-def print_table(title: str, rows: Sequence[Mapping[str, str | int | None]]) -> None:
+def _cell(value: str | float | None) -> str:
+    if isinstance(value, float):
+        return f"{value:.3g}"
+    return "-" if value is None else f"{value:,}" if isinstance(value, int) else visible(value)
+
+
+def print_table(title: str, rows: Sequence[Mapping[str, str | float | None]]) -> None:
     """Print a table, numbers to the right, without columns of None; a narrow terminal shows a line for each cell."""
     table = Table(title=_shown(title), title_justify="left")
-    columns = {}
-    for name in rows[0]:
-        cells = [row[name] for row in rows]
-        words = ("-" if cell is None else f"{cell:,}" if isinstance(cell, int) else visible(cell) for cell in cells)
-        columns |= {visible(name): list(words)} if any(cell is not None for cell in cells) else {}
+    names = [name for name in rows[0] if any(row[name] is not None for row in rows)]
+    columns = {visible(name): [_cell(row[name]) for row in rows] for name in names}
     widest = 1
     for place, (name, cells) in enumerate(columns.items()):
         widest += 3 + max(map(len, [name, *cells]))

@@ -1,28 +1,24 @@
 """Results of the commands on the terminal."""
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sliplens.cli.console import Terminal, print_file, print_table, say
-from sliplens.progress import fold_equal, number_of
+from sliplens.progress import number_of
 
 if TYPE_CHECKING:
     from sliplens.grip.records import Grip
     from sliplens.models.predictions import Predictions
     from sliplens.recordings import Dataset, TrialInfo
-    from sliplens.recordings.labelling import Labelling
     from sliplens.report.page import Written
     from sliplens.results.evaluation import Evaluation
     from sliplens.results.faithfulness import Faithfulness
 
-_MOST_ROWS = 24
-"""Number of frames or trials that are listed one by one."""
-_MOST_TRIALS = 40
-"""Number of trials with a line each."""
-_MOST_NAMES = 6
-"""Number of names in a cell."""
+_MOST_ROWS = 24  # number of frames or trials that are listed one by one
+_MOST_TRIALS = 40  # number of trials with a line each
+_MOST_NAMES = 6  # number of names in a cell
 
 
 def show_predictions(predictions: "Predictions") -> None:
@@ -52,16 +48,12 @@ def show_predictions(predictions: "Predictions") -> None:
         lowest = lowest_frame(trial)
         row = {} if lowest is None else trial.slice(lowest, 1).to_pylist()[0]
         time_s = row.get("time_s")
+        touches = int(trial["touches"].to_numpy().sum()) if "touches" in trial.column_names else None
+        at = lowest and f"frame {lowest}" if time_s is None else f"{time_s:.2f} s"
         rows.append(
-            {
-                "trial": name,
-                "lowest": _percent(row.get("prediction")) or "none",
-                "90 % interval": _interval(row.get("low_90"), row.get("high_90")),
-                "at": lowest and f"frame {lowest}" if time_s is None else f"{time_s:.2f} s",
-                "frames": len(trial),
-                "touch": int(trial["touches"].to_numpy().sum()) if "touches" in trial.column_names else None,
-                "withheld": len(trial) - trial["withheld"].null_count or None,
-            }
+            {"trial": name, "lowest": _percent(row.get("prediction")) or "none"}
+            | {"90 % interval": _interval(row.get("low_90"), row.get("high_90")), "at": at, "frames": len(trial)}
+            | {"touch": touches, "withheld": len(trial) - trial["withheld"].null_count or None}
         )
     print_table("Safety margins", rows)
     if len(names) > _MOST_TRIALS:
@@ -76,52 +68,28 @@ def _interval(low: float | None, high: float | None) -> str | None:
     return None if low is None or high is None else f"{100 * low:.0f} to {100 * high:.0f} %"
 
 
-def show_labelled(title: str, data: "Dataset", *, audit: bool) -> None:
+def show_labelled(data: "Dataset", *, audit: bool) -> None:
     """Draw the audit pages that are missing, and print what labels rest on and which frames have none."""
-    from sliplens.plots.sheets import write_audits
+    from sliplens.plots.sheets import describe_labels, write_audits
 
     if audit and write_audits(data, data.folder / "audit", on_progress=Terminal()):
         print_file(data.folder / "audit", "a page for each trial: look at them before you train")
-    rows, notes, invalid = [], [], {}
-    for info in data.trials:
+    whole = len(data.trials) <= _MOST_NAMES
+    for info in data.trials[:_MOST_ROWS]:
         labels = data.read_labels(info)
-        counts = Counter(labels.count())
-        valid = counts.pop("valid", 0)
-        rows.append({"trial": info.trial, "valid": f"{valid} of {info.frames}", **_basis(labels.labelling)})
-        notes += labels.labelling.notes if labels.labelling is not None else ()
-        invalid[info.trial] = counts
-    print_table(title, rows[:_MOST_ROWS])
-    if len(rows) > _MOST_ROWS:
-        say(f"  and {number_of(len(rows) - _MOST_ROWS, 'more trial')}; `sliplens check` names those in doubt")
-        invalid = {f"all {len(rows)} trials": sum(invalid.values(), Counter())}
-    for line in fold_equal(dict.fromkeys(notes)):
-        say(f"  note: {line}")
-    for trial, counts in invalid.items():
-        reasons = ", ".join(f"{count:,} {reason}" for reason, count in counts.items())
-        say(f"  {trial}: frames without a valid label: {reasons or 'none'}")
+        facts = ["its labels came with it"]
+        if labels.labelling is not None:
+            facts = describe_labels(labels, labels.labelling)
+        say(f"  {info.trial}: {'; '.join(facts if whole else facts[:1])}")
+    if (rest := len(data.trials) - _MOST_ROWS) > 0:
+        say(f"  and {number_of(rest, 'more trial')}; `sliplens check` names those in doubt")
 
 
-def _basis(labelling: "Labelling | None") -> dict[str, str | None]:
-    """Return the cells of friction, lag and reference."""
-    friction, lag, reference = "came with it", None, "its own"
-    if labelling is not None and (basis := labelling.basis) is not None:
-        mu, low, high = basis.friction.mu, basis.friction.low, basis.friction.high
-        friction = f"{mu:.3f} given" if low == high else f"{mu:.3f} [{low:.3f}, {high:.3f}]"
-        if basis.lag is not None:
-            lag = "unknown" if basis.lag.doubt else f"{1e3 * basis.lag.lag_s:+.1f} +- {1e3 * basis.lag.sigma_s:.1f}"
-            lag += " (applied)" if basis.lag_applied else ""
-    if labelling is not None and labelling.reference.index is not None:
-        reference = f"frame {labelling.reference.index}"
-    return {"mu": friction, "lag, ms": lag, "reference": reference}
-
-
-def show_splits(trials: "Sequence[TrialInfo]", splits: Sequence[str]) -> None:
-    """Print the content of each split, and the trials that change theirs."""
-    groups, moves, usual = defaultdict(list), defaultdict(list), ("train", "validation", "test")
-    for info, split in zip(trials, splits, strict=True):
-        groups[split].append(info)
-        if info.split != split:
-            moves[info.split, split].append(info.trial)
+def show_splits(trials: "Sequence[TrialInfo]") -> None:
+    """Print the content of each split."""
+    groups, usual = defaultdict(list), ("train", "validation", "test")
+    for info in trials:
+        groups[info.split].append(info)
     rows = [
         {
             "split": name,
@@ -134,14 +102,19 @@ def show_splits(trials: "Sequence[TrialInfo]", splits: Sequence[str]) -> None:
         for name, infos in sorted(groups.items(), key=lambda group: (*(group[0] != each for each in usual), group[0]))
     ]
     print_table("Splits", rows)
-    if moves:
-        rows = [
-            {"from": old, "to": new, "trials": len(names), "which": _names(names)}
-            for (old, new), names in sorted(moves.items())
-        ]
-        print_table("Moves", rows)
-    else:
-        say("every trial is in its split already")
+
+
+def show_moves(trials: "Sequence[TrialInfo]", splits: Sequence[str]) -> None:
+    """Print the trials that change their split."""
+    moves = defaultdict(list)
+    for info, split in zip(trials, splits, strict=True):
+        if info.split != split:
+            moves[info.split, split].append(info.trial)
+    rows = [
+        {"from": old, "to": new, "trials": len(names), "which": _names(names)}
+        for (old, new), names in sorted(moves.items())
+    ]
+    print_table("Moves", rows) if rows else say("every trial is in its split already")
 
 
 def _names(names: Iterable[str]) -> str:
@@ -159,22 +132,15 @@ def print_scores(evaluation: "Evaluation") -> None:
         say(
             f"  note: {count} of the {trials} trials trained or validated this network, which makes its scores too good"
         )
-    rows = []
-    for name, scores in evaluation.conditions.items():
-        lead = evaluation.lead_times[name]
-        rows.append(
-            {
-                "condition": name,
-                "frames": scores.frames,
-                "MSE": f"{scores.mse:.4f}",
-                "R2": "none" if scores.r2 is None else f"{scores.r2:.3f}",
-                "MAE": f"{scores.mae:.3f}",
-                "90 %": _percent(evaluation.coverage[name].get("0.9")),
-                "warns": lead.median_ms and f"{lead.median_ms / 1e3:.2f} s {lead.warned}/{lead.trials}",
-                "false": f"{lead.false_per_minute:.1f}/min",
-            }
-        )
-    print_table(f"{evaluation.input} images, {evaluation.split} trials; 90 %: labels within this interval", rows)
+    rows = [
+        {"condition": name, "frames": scores.frames, "MSE": scores.mse, "R2": scores.r2, "MAE": scores.mae}
+        | {"90 %": _percent(evaluation.coverage[name].get("0.9")), "warned": f"{lead.warned}/{lead.trials}"}
+        | {"ms": lead.median_ms, "false": lead.false_per_minute}
+        for name, scores in evaluation.conditions.items()
+        for lead in [evaluation.lead_times[name]]
+    ]
+    about = "90 %: labels within this interval; false: warnings a minute"
+    print_table(f"{evaluation.input} images, {evaluation.split} trials; {about}", rows)
     if evaluation.friction:
         say(f"friction: {evaluation.friction}")
     if evaluation.ratio_r2:
@@ -186,29 +152,17 @@ def print_scores(evaluation: "Evaluation") -> None:
 
 def print_faithfulness(faithfulness: "Faithfulness") -> None:
     """Print the scores of each method, the deletion score of the thesis, and the alarms."""
-    rows, deletion = [], faithfulness.deletion
-    for scores in faithfulness.scores:
-        gain, lead = scores.srg, scores.lead_over_controls
-        ends = None if gain.low is None or gain.high is None else f"{gain.low:+.3f} to {gain.high:+.3f}"
-        rows.append(
-            {
-                "method": scores.method,
-                "gain": f"{gain.estimate:+.3f}",
-                "95 % interval": ends,
-                "less the best control": None if lead is None else f"{lead.gap.estimate:+.3f}",
-            }
-        )
-    where = f"{faithfulness.input} images ({faithfulness.source})"
+    deletion, where = faithfulness.deletion, f"{faithfulness.input} images ({faithfulness.source})"
+    rows = [
+        {"method": scores.method, "gain": scores.srg.estimate, "95 % from": scores.srg.low, "to": scores.srg.high}
+        | {"less the best control": lead and lead.gap.estimate}
+        for scores in faithfulness.scores
+        for lead in [scores.lead_over_controls]
+    ]
     print_table(f"symmetric gain, {where}: higher is more faithful", rows)
     if deletion is not None:
         rows = [
-            {
-                "method": name,
-                "D_AUC": f"{scores.mean:.3f}",
-                "+-": f"{scores.sd:.3f}",
-                "last step": f"{scores.last_step_mean:.3f}",
-                "frames": scores.frames,
-            }
+            {"method": name, "D_AUC": scores.mean, "+-": scores.sd, "last step": scores.last_step_mean}
             for name, scores in deletion.methods.items()
         ]
         print_table(f"deletion score of the thesis, {where}, fill grey: lower is more faithful", rows)

@@ -317,8 +317,7 @@ class Holder:
     ) -> None:
         self._settings, self._ceiling_n, self._command_n = settings, ceiling_n, command_n
         self._lock, self._friction_known = Lock(), False
-        self._with_friction = [False] * fingers
-        """True for each fingertip whose last margin used a friction."""
+        self._with_friction = [False] * fingers  # true for each fingertip whose last margin used a friction
         self._readings: list[tuple[Reading, float] | None] = [None] * fingers
         """Newest reading of each fingertip, and the time of its frame."""
         self._gates, self._slip = [SlipGate() for _ in range(fingers)], False

@@ -213,8 +213,7 @@ class GripLoop:
         self.plant, self.sensor, self.controller = plant, sensor, controller
         delay = math.ceil(latency_s / PERIOD_S - 1e-9)
         self._past: deque[tuple[PlantState, FingertipReading, Bool[np.ndarray, " episodes"]]] = deque(maxlen=delay + 1)
-        self._fingers: list[tuple[SlipBatch, SlipGate]] = []
-        """Detector and gate of each finger, as in a real hold."""
+        self._fingers: list[tuple[SlipBatch, SlipGate]] = []  # detector and gate of each finger, as in a real hold
         self._forces: deque[Episodes] = deque(maxlen=round(SPRINGS_BACK_S / PERIOD_S) + 1)
         if sensor is not None:
             rest, *still = sensor.still_markers(_STILL_FRAMES)

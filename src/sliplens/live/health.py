@@ -20,8 +20,7 @@ Plane = Float32[np.ndarray, "height width"]
 
 _WHITE, _BLACK = 250, 5
 _TILES = 4
-_DIM = 10.0
-"""Grey levels below which a ratio of brightness means nothing."""
+_DIM = 10.0  # grey levels below which a ratio of brightness means nothing
 _DROPS_OVER_S = 1.0
 _OLDEST_S = 0.1
 _BLOCK_PX = 4
@@ -66,15 +65,12 @@ class HealthMonitor:
         self._before: np.ndarray | None = None
         self._changed_s = 0.0
         self._plane: Plane | None = None
-        self._half_planes: list[Plane] = []
-        """Picture at the last change of the upper half, and of the lower one."""
+        self._half_planes: list[Plane] = []  # picture at the last change of the upper half, and of the lower one
         self._quiet = np.full(2, np.inf)
         self._force_n: np.ndarray | None = None
-        self._changed_force_n: np.ndarray | None = None
-        """Force at the last change of either half."""
+        self._changed_force_n: np.ndarray | None = None  # force at the last change of either half
         self._numbers: deque[tuple[float, int]] = deque()
-        self._last: dict[str, tuple[float, Check]] = {}
-        """Time and result of each check when it was made last."""
+        self._last: dict[str, tuple[float, Check]] = {}  # time and result of each check when it was made last
         self._markers: Tracks | None = None
 
     def check(self, frame: LiveFrame, markers: Tracks | None = None, /) -> tuple[Check, ...]:
@@ -318,8 +314,7 @@ def severity(check: Check) -> float:
     return over / max(under, 1e-6)
 
 
-_SPREAD = -2.07, 0.59
-"""Offset and slope of the logit of what the network itself gives for an error above `OFF`."""
+_SPREAD = -2.07, 0.59  # offset and slope of the logit of what the network itself gives for an error above `OFF`
 
 
 def margin_risk(

@@ -228,8 +228,7 @@ class LiveReader:
         self._forces = None if forces is None else ForceStream(forces)
         self._frames: Mailbox[LiveFrame] = Mailbox()
         self._news, self._stopped, self._over = Condition(), Event(), Event()
-        self._last: Reading | None = None
-        """Reading of the last frame; None where frames do not follow each other."""
+        self._last: Reading | None = None  # reading of the last frame; None where frames do not follow each other
         self._newest: Reading | None = None
         self._subscribers: dict[Subscriber, None] = {}
         self.error: BaseException | None = None

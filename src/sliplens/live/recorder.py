@@ -149,8 +149,7 @@ class ForceStream:
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
         self._closed, self._delay_s = Event(), np.inf
-        self._samples = deque[tuple[float, ...]]()
-        """Time on the sensor's clock, time of arrival, and force of each."""
+        self._samples = deque[tuple[float, ...]]()  # time on the sensor's clock, time of arrival, and force of each
         self.trouble: str | None = None
         """Why no more samples come, with the cure; None while they may."""
 
@@ -198,7 +197,8 @@ class ForceStream:
                     arrived_s, fields = time.monotonic(), line.split(separator)
                     if len(fields) < len(names):
                         counts = f"{len(fields)} columns, {len(names)} are named"
-                        raise RecordingError(f"{path} has a line of {counts}")  # noqa: TRY301 (reported below)
+                        self.trouble = f"{path} has a line of {counts}; the forces of {path} end here"
+                        return
                     values = [float(fields[at]) * scale for at, scale in columns]
                     force_n, stamp_s = values[: len(forces)], values[-1] if times else np.nan
                     if len(force_n) == 2:  # normal and tangential, as `import` lays them along z and x

@@ -17,16 +17,12 @@ Fields: TypeAlias = np.ndarray
 Rows: TypeAlias = Int[np.ndarray, " rows"]
 Contacts: TypeAlias = Float[np.ndarray, " contacts"]
 
-_FEWEST = 6
-"""Least number of markers that shows the motion of a contact."""
-_FEWEST_FRAMES = 3
-"""Least number of frames in the window, however slow the camera is."""
-_LEAST_NOISE_PX = 0.02
-"""Of compressed video, whose frames repeat, the noise cannot be seen."""
+_FEWEST = 6  # least number of markers that shows the motion of a contact
+_FEWEST_FRAMES = 3  # least number of frames in the window, however slow the camera is
+_LEAST_NOISE_PX = 0.02  # of compressed video, whose frames repeat, the noise cannot be seen
 _REPRESSED = 1 / 0.75
 _LET_GO = 0.3
-_BENT_SHARE = 0.1
-"""Of what the pattern lets expect; skin that springs back is more rigid than it was sheared."""
+_BENT_SHARE = 0.1  # of what the pattern lets expect; skin that springs back is more rigid than it was sheared
 _CONFIRMED_S = 0.3
 """Time after a recoil in which a controller has tightened the grip, and a pull that is let go by hand has gone."""
 _CARRIED, _TIGHTENED, _CARRIED_TIGHTENED = 0.7, 1.1, 0.75
@@ -39,8 +35,7 @@ HOLD_FALL, SLIP_FALL = 0.05, 0.1
 """Fall of the mean shear, as a share, up to which a grasp that begins pressed holds, and from which it slips. Chosen on
 48 simulated grips (seed 30), 8 to 60 frames a second, 0.1 to 0.2 px of noise: 73 to 98 % fall by more within 0.5 s of
 the slip, none before. Spread of increments and slip zone add nothing there (AUC 0.83 and 0.52, the fall 0.999)."""
-_RAYLEIGH_95 = 2.45
-"""95 % of the lengths of two-dimensional normal noise are below so many standard deviations."""
+_RAYLEIGH_95 = 2.45  # 95 % of the lengths of two-dimensional normal noise are below so many standard deviations
 _STILL_S, _STILL_FRAMES = 0.4, 12
 """Time at the beginning in which the noise of the markers is measured, and the frames that this takes at least."""
 _WINDOW_S, _PATTERN_S, _REPORTED_S = 0.1, 0.4, 0.25
@@ -102,24 +97,19 @@ class SlipBatch:
         """Times and motions (NaN where a marker is not seen) of the still frames."""
         self._visible = np.ones((contacts, markers), dtype=bool)
         self._fit = _affine_weights(self._rest, self._visible)
-        self._noise_px = np.full(contacts, np.nan)
-        """Standard deviation of a coordinate of a marker of the still sensor."""
+        self._noise_px = np.full(contacts, np.nan)  # standard deviation of a coordinate of a marker of the still sensor
         self._together_px = np.full(contacts, np.nan)
         """Standard deviation if all motion were that of the markers as a whole: more where a camera trembles."""
         self._frames: deque[_Frame] = deque()
-        self._window = np.zeros(contacts, dtype=int)
-        """Number of frames in the window of each contact."""
+        self._window = np.zeros(contacts, dtype=int)  # number of frames in the window of each contact
         self._hold = np.full(self._rest.shape, np.nan)
         """Motion of the markers up to the end of the press; NaN without a contact."""
-        self._pattern = np.full(self._rest.shape, np.nan)
-        """Mean motion since then, of the frames that left the window."""
+        self._pattern = np.full(self._rest.shape, np.nan)  # mean motion since then, of the frames that left the window
         self._inner = np.zeros((contacts, markers), dtype=bool)
         self._pressed, self._hold_s, self._recoil_s = np.zeros((3, contacts))
         self._slip_s, self._least_px = np.full(contacts, np.nan), np.full(contacts, np.inf)
-        self._recoils_at: dict[int, _Recoil] = {}
-        """Recoils that are not judged yet, by contact."""
-        self._judged_s = np.full(contacts, np.nan)
-        """Time of the recoil that was judged last."""
+        self._recoils_at: dict[int, _Recoil] = {}  # recoils that are not judged yet, by contact
+        self._judged_s = np.full(contacts, np.nan)  # time of the recoil that was judged last
 
     def update(self, positions_px: Float[np.ndarray, "contacts markers 2"], time_s: float, /) -> ContactStates:
         """Take the markers of a frame, in the order of `rest_px`, NaN where one is not seen; times must rise."""

@@ -109,7 +109,8 @@ def describe_labels(recording: Recording, labelling: Labelling) -> list[str]:
             facts.append(f"lag unknown: {lag.doubt}" if lag else "lag not estimated")
         else:
             late, applied = f"{1000 * lag.lag_s:.1f} ± {1000 * lag.sigma_s:.1f} ms", "" if basis.lag_applied else "not "
-            facts.append(f"camera late by {late}, {applied}taken off (correlation {lag.correlation:.2f})")
+            how = "given by hand" if lag.correlation is None else f"correlation {lag.correlation:.2f}"
+            facts.append(f"camera late by {late}, {applied}taken off ({how})")
     return [*facts, *labelling.notes]
 
 
