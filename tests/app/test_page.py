@@ -128,7 +128,7 @@ def test_the_picture_is_frozen_and_explained_while_the_margin_runs_on(seen):
 
 def test_what_is_recorded_is_a_data_set_that_passes(seen, page: LivePage):
     seen.get_by_role("button", name="Record").click()
-    wait_until(seen, "parseInt(document.querySelector('#recording').textContent.match(/(\\d+) frames/)?.[1]) >= 4")
+    wait_until(seen, "parseInt(document.querySelector('#recording').textContent.match(/(\\d+) recorded/)?.[1]) >= 4")
     seen.get_by_role("button", name="Stop recording").click()
     seen.get_by_text("recorded into").wait_for()
     assert check_dataset(page.record_into) == ()

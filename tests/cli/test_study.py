@@ -44,7 +44,7 @@ def test_a_study_makes_every_stage_and_the_page_and_keeps_what_is_there(
     for path in gone.iterdir():
         path.unlink()
     gone.rmdir()
-    monkeypatch.setattr("sliplens.cli.output.draw_report", lambda _: None)  # the page was drawn above
+    monkeypatch.setattr("sliplens.cli.commands.draw_report", lambda _: None)  # the page was drawn above
     capsys.readouterr()
     assert run(*words, "-o", output, "--on", "processes=2") == 0
     told = capsys.readouterr().out

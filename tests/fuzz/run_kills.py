@@ -46,7 +46,7 @@ from hostile import FORMATS  # noqa: E402
 from outcomes import in_a_child, parser, resume, tabulate  # noqa: E402
 from small import make_recording, save_untrained  # noqa: E402
 
-import sliplens.cli.output  # noqa: E402
+import sliplens.cli.commands  # noqa: E402
 import sliplens.files  # noqa: E402
 import sliplens.study.run as study  # noqa: E402
 from sliplens.cli import main as command  # noqa: E402
@@ -289,7 +289,7 @@ def shorten_study() -> None:
     defaults = {"tests": ("score", "faithfulness", "truth"), "settings": study.SETTINGS, "steps": 8}
     StudyConfig.__init__.__kwdefaults__ = {**(StudyConfig.__init__.__kwdefaults__ or {}), **defaults}
     study.JudgingByTruth = partial(study.JudgingByTruth, pairs=2)
-    sliplens.cli.output.draw_report = lambda workspace: None  # noqa: ARG005
+    sliplens.cli.commands.draw_report = lambda workspace: None  # noqa: ARG005
 
 
 class Bench:

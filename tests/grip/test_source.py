@@ -7,9 +7,8 @@ import pytest
 from there import there
 
 from sliplens.errors import InputError
-from sliplens.files import DEFAULT_NETWORK
 from sliplens.grip.controllers import MarginLaw
-from sliplens.grip.source import GripSource, GripStatus, open_grip, usual_network
+from sliplens.grip.source import GripSource, GripStatus, open_reader
 from sliplens.live.contract import LiveOptions, Pace
 from sliplens.live.reading import Reading, SlipState
 
@@ -88,12 +87,16 @@ def test_what_cannot_be_done_is_refused(source: GripSource, told):
 
 
 def test_a_gripper_is_named_with_what_it_holds():
-    assert there(open_grip("grip:egg", LiveOptions(rate_hz=10.0))).name == "a simulated gripper (egg)"
-    assert open_grip("gripper.mp4", LiveOptions(speed=2.0)) is None
-    with pytest.raises(InputError, match="the simulated gripper takes no --speed"):
-        open_grip("grip", LiveOptions(speed=2.0))
+    assert open_reader("grip:egg", options=LiveOptions(rate_hz=10.0)).source.name == "a simulated gripper (egg)"
+    for name, options, error in (
+        ("grip:anvil", LiveOptions(), "there is no object named 'anvil'"),
+        ("grip", LiveOptions(speed=2.0), "the simulated gripper takes no --speed"),
+        ("gripper.mp4", LiveOptions(speed=2.0), "gripper.mp4 is no source"),
+    ):
+        with pytest.raises(InputError, match=error):
+            open_reader(name, options=options)
 
 
-def test_simulated_sensors_of_the_training_have_a_network():
-    names = ("simulated", "simulated:chromatouch", "grip", "grip:egg", "simulated:flat-gel", "0", "gripper.mp4")
-    assert list(map(usual_network, names)) == [DEFAULT_NETWORK] * 4 + [None] * 3
+@pytest.mark.parametrize("name", ["simulated", "simulated:chromatouch", "grip", "grip:egg", "simulated:flat-gel", "0"])
+def test_simulated_sensors_of_the_training_have_a_network(name: str):
+    assert (open_reader(name).network is not None) == (name not in {"simulated:flat-gel", "0"})

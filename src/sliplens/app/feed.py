@@ -228,15 +228,14 @@ class Feed:
             is_wanted = any(client.shows_map and client.ready for client in tuple(self.clients))
             if picture is None or picture is explained or not is_wanted:
                 continue
-            explained, self.map = picture, None if picture.reading.margin is None else self.map
-            if picture.reading.margin is not None:  # without a margin there is nothing to explain
-                try:
-                    self.map = self.explain(picture, LIVE_METHOD)
-                except (SliplensError, RuntimeError):
-                    self.map = None
-                # what explainers import: to search it for garbage takes as long as some frames
-                if is_first and self.map is not None:
-                    gc.freeze()
+            explained = picture
+            try:  # without a margin there is nothing to explain
+                self.map = None if picture.reading.margin is None else self.explain(picture, LIVE_METHOD)
+            except (SliplensError, RuntimeError):
+                self.map = None
+            # what explainers import: to search it for garbage takes as long as some frames
+            if is_first and self.map is not None:
+                gc.freeze()
             self._wake()
 
     def explain(self, picture: PageFrame, method: str) -> Map:

@@ -52,6 +52,23 @@ class Command:
         return ["-o", "--output"] if parameter == "out" else aliases
 
 
+COMMANDS: dict[str, Command] = {}
+"""Commands by name; `sensor new` and the like have two words."""
+Run = Callable[..., None]
+
+
+def command(
+    name: str, function: str, example: str, *aliases: tuple[str, str], writes: str = ""
+) -> Callable[[Run], Run]:
+    """Register a function that calls a function of the library, given with its arguments, and prints the result."""
+
+    def register(run: Run) -> Run:
+        COMMANDS[name] = Command(f"sliplens.{function}", run, example, aliases, writes)
+        return run
+
+    return register
+
+
 class _Option(NamedTuple):
     """An option of a command."""
 

@@ -1,7 +1,7 @@
 """The commands: each calls a function of the library and prints its result."""
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -10,32 +10,20 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict, Unpack
 
 import msgspec
 
-from sliplens.cli import output
-from sliplens.cli.app import Command
+from sliplens.cli import data  # noqa: F401 (its commands are listed first)
+from sliplens.cli.app import COMMANDS, command
 from sliplens.cli.console import OUT, Terminal, print_file, print_table, say
-from sliplens.errors import InputError, RecordingError, SliplensError
+from sliplens.errors import InputError, SliplensError
 from sliplens.files import require_new_file, to_builtins
 from sliplens.progress import number_of, open_stage, reporting
 
 if TYPE_CHECKING:
     from sliplens.grip.controllers import HoldStep
     from sliplens.live import LiveReader
+    from sliplens.models.predictions import Predictions
+    from sliplens.report.page import Written
 
-COMMANDS: dict[str, Command] = {}
-"""Commands by name; `sensor new` and the like have two words."""
-Run = Callable[..., None]
-
-
-def command(
-    name: str, function: str, example: str, *aliases: tuple[str, str], writes: str = ""
-) -> Callable[[Run], Run]:
-    """Register a function that calls a function of the library, given with its arguments, and prints the result."""
-
-    def register(run: Run) -> Run:
-        COMMANDS[name] = Command(f"sliplens.{function}", run, example, aliases, writes)
-        return run
-
-    return register
+_MOST_FRAMES, _MOST_TRIALS = 24, 40  # numbers of frames and trials with a line each
 
 
 class _Log:
@@ -62,20 +50,6 @@ def _say_friction(name: str, reader: "LiveReader") -> None:
     """Print the friction that slips taught, with the option for the next time."""
     if (friction := reader.learnt) is not None:
         say(f"{name}: the object slipped; to hold it again, set --friction {friction.text}", aside=True)
-
-
-@command("demo", "demo:run_demo", "sliplens demo runs/demo")
-def call_demo(call: Any) -> None:
-    """Print where the page is as soon as it exists; its notes are on the page."""
-    pages, terminal = list[Path](), Terminal()
-
-    def on_page(page: Path) -> None:
-        if not pages:
-            say(f"open {page.resolve()} now: it grows while the rest is made")
-        pages.append(page)
-
-    terminal.note = lambda _: None
-    say(f"open {call(on_page=on_page, on_progress=terminal).resolve()}")
 
 
 @command(
@@ -122,25 +96,22 @@ def call_live(
     day
         Day of the recording.
     """
-    from sliplens.grip.source import open_grip, usual_network
-    from sliplens.live import LiveReader
-    from sliplens.live.contract import LiveOptions
+    from sliplens.grip.source import open_reader
+    from sliplens.live import SOURCES, list_cameras
     from sliplens.recordings import TrialFacts
     from sliplens.recordings.sensor import is_profile, load_profile
 
     if list_sources:
-        output.print_sources()
+        cameras = [{"device": device, "name": name} for device, name in list_cameras().items()]
+        print_table("Cameras", cameras) if cameras else say("no camera was found")
+        for words in ("simulated gripper that holds (grip, or grip:egg)", *(kind.words for kind in SOURCES.values())):
+            say(f"  {words}")
         return
-    arguments = {"source": "simulated", "network": None, "options": LiveOptions(), "sensor": None} | call.keywords
-    sensor = arguments["sensor"] or ""
-    profile = arguments["sensor"] = load_profile(sensor) if is_profile(sensor) else None
-    if profile is None:
-        arguments["network"] = arguments["network"] or usual_network(arguments["source"])
-    if (grip := open_grip(arguments["source"], arguments["options"])) is not None:
-        arguments |= {"source": grip, "options": None}
+    sensor = call.keywords.get("sensor", "")
+    settings = call.keywords | {"sensor": load_profile(sensor) if is_profile(sensor) else None}
     facts = TrialFacts(trial="live", sensor=sensor, object=object, condition=condition, day=day)
     with ExitStack() as stack:
-        reader = stack.enter_context(closing(LiveReader(**arguments)))
+        reader = stack.enter_context(closing(open_reader(**settings)))
         reader.send_to(*sink)
         if record is not None:
             reader.record(record, facts=facts)
@@ -161,124 +132,9 @@ def call_live(
                 log.warn((*reader.doubts, *reader.troubles))
                 if not sink:
                     say(str(reading))
-            if page and not sink and "seconds" not in arguments:
+            if page and not sink and "seconds" not in settings:
                 say(f"{reader.source.name} has ended; the page stays until Ctrl-C", aside=True)
                 Event().wait()
-
-
-@command(
-    "sensor new", "plots.figure:make_profile", "sliplens sensor new --from tip.mp4 -o tip.toml", ("source", "--from")
-)
-def call_sensor_new(call: Any) -> None:
-    """Write the profile and its picture."""
-    proposal, path = call(), Path(call.keywords["out"])
-    for sentence in proposal.notes:
-        say(f"  {sentence}")
-    print_file(path, "correct it where the picture shows an error")
-    print_file(path.with_suffix(".png"), "what the profile does to a frame")
-
-
-@command(
-    "simulate",
-    "simulation.trials:simulate",
-    "sliplens simulate runs/mine/data --preset small",
-    writes="folder of the data set",
-)
-def call_simulate(call: Any) -> None:
-    """Print the splits."""
-    output.show_splits(call().trials)
-
-
-@command(
-    "import",
-    "recordings.importing:import_recordings",
-    "sliplens import cup.mp4 --forces cup.csv --sensor tip.toml -o runs/mine/data",
-)
-def call_import(call: Any, *, audit: bool = True) -> None:
-    """Print what the labels rest on.
-
-    Parameters
-    ----------
-    audit
-        Draw a page for each trial, in `audit/` of the folder, from which to judge its labels.
-    """
-    data = call()
-    output.show_labelled(data, audit=audit)
-    if data.left_out:
-        print_table("Left out", [{"trial": trial.trial, "why": trial.why} for trial in data.left_out])
-        raise SystemExit(1)
-
-
-@command("label", "recordings.corrections:label_dataset", "sliplens label runs/mine/data --draft corrections.csv")
-def call_label(call: Any, *, draft: Path | None = None, audit: bool = True) -> None:
-    """Print what the labels rest on.
-
-    Parameters
-    ----------
-    draft
-        Change no label: write a table of the present labels, to be edited and given to --corrections.
-    audit
-        Draw a page for each trial, in `audit/` of the folder, from which to judge its labels.
-    """
-    from sliplens.recordings.corrections import draft_corrections
-    from sliplens.recordings.dataset import load_dataset
-
-    arguments = call.keywords
-    if draft is not None and arguments.keys() & {"out", "corrections"}:
-        raise InputError("--draft changes no label; leave --out and --corrections out")
-    folder = arguments["data"]
-    data, out = load_dataset(folder), Path(arguments.get("out") or folder)
-    if draft is not None:
-        draft_corrections(data, draft)
-        print_file(draft, f"edit it, then: sliplens label {folder} --corrections {draft}")
-        return
-    output.show_labelled(call(data=data, out=out), audit=audit)
-
-
-@command("recover", "recordings.dataset:recover_dataset", "sliplens recover runs/mine/data")
-def call_recover(call: Any) -> None:
-    """Print what the data set holds."""
-    data = call()
-    say(f"{data.folder} holds {number_of(len(data.trials), 'trial')}, {number_of(data.frames, 'frame')}")
-
-
-@command("split", "recordings.splits:split_dataset", "sliplens split runs/mine/data --splits object --dry-run")
-def call_split(call: Any) -> None:
-    """Print the splits, and the trials that move."""
-    from sliplens.recordings.dataset import load_dataset
-
-    data = load_dataset(call.keywords["data"])
-    result = call(data=data)
-    moves = sum(info.split != split for info, split in zip(data.trials, result.splits, strict=True))
-    output.show_splits([replace(info, split=split) for info, split in zip(data.trials, result.splits, strict=True)])
-    output.show_moves(data.trials, result.splits)
-    for note in result.notes:
-        say(f"note: {note}")
-    if call.keywords.get("dry_run"):
-        say("nothing is written (--dry-run)")
-        return
-    print_file(data.folder, f"{moves} of {len(data.trials)} trials moved")
-    if moves:
-        say("networks trained before had other splits: a trial of the test may have trained them; train again")
-
-
-@command("check", "recordings.check:check_dataset", "sliplens check runs/mine/data")
-def call_check(call: Any) -> None:
-    """Print the findings; exit code 2 if there are any."""
-    from sliplens.recordings.dataset import load_dataset
-
-    data = load_dataset(call.keywords["data"])
-    findings = call(data=data)
-    if errors := [{"where": each.where, "what": each.what} for each in findings if not each.doubt]:
-        print_table("Findings", errors)
-        count = number_of(len(errors), "error")
-        raise RecordingError(f"{data.folder} has {count}, listed above; correct or make these trials again")
-    size = f"{number_of(len(data.trials), 'trial')}, {number_of(data.frames, 'frame')}"
-    if doubtful := {finding.where for finding in findings}:
-        about = f"the notes above put labels of {number_of(len(doubtful), 'trial')} in doubt"
-        say(f"{data.folder} is whole: {size}, every hash and law holds, but {about}")
-        return
-    say(f"{data.folder} is sound: {size}, every hash and law holds")
 
 
 @command("slip", "live.slip_clips:evaluate_slip", "sliplens slip lifts.csv --after 10")
@@ -287,41 +143,6 @@ def call_slip(call: Any) -> None:
     with reporting(Terminal()), open_stage("Reading clips"):
         result = call()
     print_table(f"Slip of {number_of(len(result.fall), 'clip')}", result.scores.to_arrow().to_pylist())
-
-
-@command(
-    "view",
-    "live.viewer:view",
-    "sliplens view runs/mine/data --trial cup --predictions margins.parquet --maps runs/mine/explain",
-)
-def call_view(call: Any) -> None:
-    """Print what is shown."""
-    viewed = call()
-    about = f"{viewed.trial}, {number_of(viewed.frames, 'frame')}"
-    if (out := call.keywords.get("out")) is None:
-        say(f"{about}, are in the Rerun viewer")
-        say("the viewer reports its use to its makers, not what it shows: see `rerun analytics disable`")
-    else:
-        print_file(Path(out), f"{about}; open it with `rerun {out}`")
-
-
-@command(
-    "track",
-    "markers.tracking:track",
-    "sliplens track cup.mp4 --reference untouched.png -o markers.parquet",
-    writes="table to write",
-)
-def call_track(call: Any) -> None:
-    """Print how many markers were followed."""
-    from sliplens.recordings.sensor import load_profile
-
-    arguments = call.keywords
-    if "markers" not in arguments and "sensor" in arguments:
-        arguments["markers"] = load_profile(arguments["sensor"]).markers or "auto"
-    tracking = call()
-    for trial in tracking.trials:
-        say(str(trial))
-    print_file(tracking.path, f"{number_of(tracking.frames, 'frame')} of {number_of(len(tracking.trials), 'trial')}")
 
 
 @command(
@@ -358,7 +179,70 @@ def call_evaluate(call: Any, *, device: str = "cpu") -> None:
     evaluation = call(run=load(call.keywords["run"], device=device))
     if (out := call.keywords.get("out")) is not None and not (picture := Path(out) / "evaluation.png").is_file():
         save_page(plot(evaluation), picture)
-    output.print_scores(evaluation)
+    trials = len(evaluation.trials)
+    if count := evaluation.known_trials:
+        say(
+            f"  note: {count} of the {trials} trials trained or validated this network, which makes its scores too good"
+        )
+    rows = [
+        {"condition": name, "frames": scores.frames, "MSE": scores.mse, "R2": scores.r2, "MAE": scores.mae}
+        | {"90 %": _percent(evaluation.coverage[name].get("0.9")), "warned": f"{lead.warned}/{lead.trials}"}
+        | {"ms": lead.median_ms, "false": lead.false_per_minute}
+        for name, scores in evaluation.conditions.items()
+        for lead in [evaluation.lead_times[name]]
+    ]
+    about = "90 %: labels within this interval; false: warnings a minute"
+    print_table(f"{evaluation.input} images, {evaluation.split} trials; {about}", rows)
+    if evaluation.friction:
+        say(f"friction: {evaluation.friction}")
+    if evaluation.ratio_r2:
+        scores = (f"{name} {'none' if r2 is None else f'{r2:.3f}'}" for name, r2 in evaluation.ratio_r2.items())
+        say(f"F_t / F_n is predicted with R2 {', '.join(scores)}")
+    if evaluation.risk is not None:
+        say(str(evaluation.risk))
+
+
+def show_predictions(predictions: "Predictions") -> None:
+    """Print each frame if they are few, else the lowest margin of each trial."""
+    from sliplens.models.predictions import lowest_frame
+
+    table = predictions.to_arrow()
+    rows = []
+    for row in table.to_pylist() if predictions.frames <= _MOST_FRAMES else ():
+        frame = row.get("file") or f"{row['trial']} {row['frame']}"
+        rows.append(
+            {"frame": frame, "safety margin": _percent(row["prediction"]) or "withheld"}
+            | {"90 % interval": _interval(row["low_90"], row["high_90"])}
+            | {"true": _percent(row.get("safety_margin")), "known": _percent(row.get("known"))}
+        )
+    if rows:
+        print_table("Safety margins", rows)
+        return
+    column = table["trial"].to_numpy()
+    names = list(dict.fromkeys(column))
+    for name in names[:_MOST_TRIALS]:
+        trial = table.filter(column == name)
+        lowest = lowest_frame(trial)
+        row = {} if lowest is None else trial.slice(lowest, 1).to_pylist()[0]
+        time_s = row.get("time_s")
+        touches = int(trial["touches"].to_numpy().sum()) if "touches" in trial.column_names else None
+        at = lowest and f"frame {lowest}" if time_s is None else f"{time_s:.2f} s"
+        rows.append(
+            {"trial": name, "lowest": _percent(row.get("prediction")) or "none"}
+            | {"90 % interval": _interval(row.get("low_90"), row.get("high_90")), "at": at, "frames": len(trial)}
+            | {"touch": touches, "withheld": len(trial) - trial["withheld"].null_count or None}
+        )
+    print_table("Safety margins", rows)
+    if len(names) > _MOST_TRIALS:
+        say(f"and {number_of(len(names) - _MOST_TRIALS, 'more trial')}; -o margins.csv writes every frame")
+
+
+def _percent(value: float | None) -> str | None:
+    return None if value is None else f"{100 * value:.0f} %"
+
+
+def _interval(low: float | None, high: float | None) -> str | None:
+    return None if low is None or high is None else f"{100 * low:.0f} to {100 * high:.0f} %"
 
 
 @command(
@@ -381,7 +265,7 @@ def call_predict(call: Any, *, plot: Path | None = None) -> None:
         require_new_file(plot, overwrite=call.keywords.get("overwrite", False))
     predictions = call()
     predictions = replace(predictions, rows=predictions.to_arrow())  # a file is loaded once
-    output.show_predictions(predictions)
+    show_predictions(predictions)
     for reason, frames in predictions.withheld.items():
         say(f"withheld in {number_of(frames, 'frame')}: {reason}")
     if "friction" in call.keywords:
@@ -413,9 +297,26 @@ command(
 )(lambda call: call())
 
 
-command("score", "study.scoring:score", "sliplens score runs/mine/train runs/mine/explain -o runs/mine/score")(
-    lambda call: output.print_faithfulness(call())
-)
+@command("score", "study.scoring:score", "sliplens score runs/mine/train runs/mine/explain -o runs/mine/score")
+def call_score(call: Any) -> None:
+    """Print the scores of each method, the deletion score of the thesis, and the alarms."""
+    faithfulness = call()
+    deletion, where = faithfulness.deletion, f"{faithfulness.input} images ({faithfulness.source})"
+    rows = [
+        {"method": scores.method, "gain": scores.srg.estimate, "95 % from": scores.srg.low, "to": scores.srg.high}
+        | {"less the best control": lead and lead.gap.estimate}
+        for scores in faithfulness.scores
+        for lead in [scores.lead_over_controls]
+    ]
+    print_table(f"symmetric gain, {where}: higher is more faithful", rows)
+    if deletion is not None:
+        rows = [
+            {"method": name, "D_AUC": scores.mean, "+-": scores.sd, "last step": scores.last_step_mean}
+            for name, scores in deletion.methods.items()
+        ]
+        print_table(f"deletion score of the thesis, {where}, fill grey: lower is more faithful", rows)
+    for alarm in dict.fromkeys(faithfulness.alarms + (() if deletion is None else deletion.alarms)):
+        say(f"  alarm: {alarm}")
 
 
 @command(
@@ -429,7 +330,7 @@ command("score", "study.scoring:score", "sliplens score runs/mine/train runs/min
 def call_study(call: Any) -> None:
     """Draw the page."""
     call()
-    output.draw_report(Path(call.keywords["out"]))
+    draw_report(Path(call.keywords["out"]))
 
 
 @command(
@@ -441,13 +342,26 @@ def call_study(call: Any) -> None:
 )
 def call_grip(call: Any) -> None:
     """Print what became of the episodes, and draw the first."""
+    from scipy.stats import binomtest
+
     from sliplens.plots.figure import plot
     from sliplens.plots.style import save_page
 
     out = Path(call.keywords["out"])
     grip = call(out=out / "grip")
     save_page(plot(grip), out / "grip.png")
-    output.print_grip(grip)
+    table, fell, setup = grip.episodes, int(grip.episodes.dropped.sum()), grip.setup
+    low, high = binomtest(fell, len(table)).proportion_ci(method="wilson")
+    facts = {
+        "dropped": f"{fell} of {len(table)} ({100 * low:.0f} to {100 * high:.0f} %, 95 % interval)",
+        "crushed": int(table.crushed.sum()),
+        "slip, median": f"{1e3 * float(sorted(table.slip_m)[len(table) // 2]):.1f} mm",
+        "mean force": f"{table.mean_force_n.mean():.2f} N",
+        "over the least force that holds": f"{100 * table.force_excess.mean():.0f} %",
+        "time with a margin under 20 %": f"{table.under_20_s.mean():.2f} s",
+    }
+    rows = [{"": name, " ": fact} for name, fact in facts.items()]
+    print_table(f"{setup.controller} on a {setup.object}, {setup.condition}", rows)
 
 
 class HoldOptions(TypedDict, total=False):
@@ -495,9 +409,7 @@ def call_hold(call: Any, source: str, **options: Unpack[HoldOptions]) -> None:
     """
     from sliplens.grip.controllers import make_controller
     from sliplens.grip.gripper import open_gripper
-    from sliplens.grip.source import open_grip, usual_network
-    from sliplens.live import LiveReader
-    from sliplens.live.contract import LiveOptions
+    from sliplens.grip.source import open_reader
     from sliplens.live.loop import ReaderSettings
 
     arguments = call.keywords
@@ -514,9 +426,8 @@ def call_hold(call: Any, source: str, **options: Unpack[HoldOptions]) -> None:
             gripper = stack.enter_context(closing(open_gripper(gripper, messages=messages, joint=options.get("joint"))))
         readers = list["LiveReader"]()
         for name, image in zip(names, reference or [None] * len(names), strict=True):
-            network = options.get("network") or (usual_network(name) if "sensor" not in settings else None)
-            finger = open_grip(name, LiveOptions()) or name
-            readers.append(stack.enter_context(LiveReader(finger, network, reference=image, **settings)))
+            reader = open_reader(name, options.get("network"), reference=image, **settings)
+            readers.append(stack.enter_context(reader))
         log = _Log()
 
         def on_step(step: "HoldStep") -> None:
@@ -536,4 +447,22 @@ def call_hold(call: Any, source: str, **options: Unpack[HoldOptions]) -> None:
         raise SliplensError(result.why)
 
 
-command("report", "report.page:write_report", "sliplens report runs/mine")(lambda call: output.print_written(call()))
+def draw_report(workspace: Path) -> None:
+    """Draw the page of a workspace."""
+    from sliplens.report import write_report
+
+    print_written(write_report(workspace))
+
+
+def print_written(written: "Written") -> None:
+    """Print the page and the figures of a report."""
+    if written.figures:
+        count = number_of(len(written.figures) // 2, "figure")
+        print_file(written.figures[0].parent, f"{count} as PDF, their numbers as CSV")
+    print_file(written.page, "open it in a browser")
+
+
+command("report", "report.page:write_report", "sliplens report runs/mine")(lambda call: print_written(call()))
+
+
+__all__ = ["COMMANDS"]

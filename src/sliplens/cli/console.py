@@ -96,13 +96,13 @@ class Terminal:
         self._notes.clear()
 
 
-def _cell(value: str | float | None) -> str:
+def _cell(value: str | int | float | None) -> str:
     if isinstance(value, float):
         return f"{value:.3g}"
     return "-" if value is None else f"{value:,}" if isinstance(value, int) else visible(value)
 
 
-def print_table(title: str, rows: Sequence[Mapping[str, str | float | None]]) -> None:
+def print_table(title: str, rows: Sequence[Mapping[str, str | int | float | None]]) -> None:
     """Print a table, numbers to the right, without columns of None; a narrow terminal shows a line for each cell."""
     table = Table(title=_shown(title), title_justify="left")
     names = [name for name in rows[0] if any(row[name] is not None for row in rows)]

@@ -3,7 +3,9 @@
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from threading import Lock
+from typing import Unpack
 
 import numpy as np
 
@@ -15,7 +17,9 @@ from sliplens.grip.fingertip import Fingertip
 from sliplens.grip.gripper import GripperState
 from sliplens.grip.plant import LIFT_S, LIFTED_S, OBJECTS, PERIOD_S, Plant, World, least_force
 from sliplens.live.contract import LiveOptions, LiveSource, Pace
+from sliplens.live.loop import LiveReader, ReaderSettings
 from sliplens.live.reading import LiveFrame, Reading
+from sliplens.models.checkpoint import Network
 from sliplens.recordings.capture import Forces
 
 OPEN_S = 1.5
@@ -202,16 +206,18 @@ class GripSource(LiveSource):
         )
 
 
-def open_grip(name: str, options: LiveOptions) -> GripSource | None:
-    """Create the simulated gripper of a name such as `grip` or `grip:egg`; None for the name of another source."""
-    kind, _, gripped = name.partition(":")
+def open_reader(
+    source: str = "simulated", network: Network | Path | str | None = None, **settings: Unpack[ReaderSettings]
+) -> LiveReader:
+    """Create a reader of a source by its name, such as `grip` or `grip:egg` for the simulated gripper.
+
+    Simulated sources of the sensor that the network of the package was trained on have that network by default.
+    """
+    kind, _, gripped = source.partition(":")
+    if settings.get("sensor") is None and (kind == "grip" or source in {"simulated", "simulated:chromatouch"}):
+        network = network or DEFAULT_NETWORK
     if kind != "grip":
-        return None
+        return LiveReader(source, network, **settings)
+    options = settings.pop("options", None) or LiveOptions()
     options.require_only("rate_hz", what="the simulated gripper")
-    return GripSource(gripped or "cup", rate_hz=options.rate_hz or 30.0)
-
-
-def usual_network(name: str) -> str | None:
-    """Return the network of the package for a simulated source of the sensor it was trained on; None for others."""
-    simulated = name.partition(":")[0] == "grip" or name in {"simulated", "simulated:chromatouch"}
-    return DEFAULT_NETWORK if simulated else None
+    return LiveReader(GripSource(gripped or "cup", rate_hz=options.rate_hz or 30.0), network, **settings)
