@@ -24,7 +24,6 @@ from sliplens.live.sinks import (
     SINKS,
     Sender,
     Sink,
-    open_sink,
     reading_schema,
 )
 
@@ -39,7 +38,7 @@ def same(image: np.ndarray) -> bool:
 
 def test_an_mcap_file_is_read_by_mcap(tmp_path: Path):
     reader = pytest.importorskip("mcap.reader", reason="mcap is not installed")
-    sink = open_sink(f"mcap:{tmp_path / 'grip.mcap'}")
+    sink = SINKS["mcap"](str(tmp_path / "grip.mcap"))
     sink.send(READING, IMAGE)
     sink.send(replace(READING, number=8, margin=None, withheld="the camera moved"), None)
     sink.close()
@@ -59,7 +58,7 @@ def test_an_mcap_file_is_read_by_mcap(tmp_path: Path):
 
 def test_a_rerun_file_is_read_by_rerun(tmp_path: Path):
     pytest.importorskip("rerun", reason="Rerun is not installed")
-    sink = open_sink(f"rerun:{(path := tmp_path / 'grip.rrd')}")
+    sink = SINKS["rerun"](str(path := tmp_path / "grip.rrd"))
     sink.send(READING, IMAGE)
     sink.send(replace(READING, number=8, time_s=0.6, margin=None), None)
     sink.close()
@@ -81,7 +80,7 @@ def test_what_zenoh_carries_is_read_as_messages_of_ros(monkeypatch: pytest.Monke
             all_sent.set()
 
     with open_router() as (session, address), session.declare_subscriber("**", hear):
-        sink = open_sink(f"zenoh:tip/left@{address}")
+        sink = SINKS["zenoh"](f"tip/left@{address}")
         sink.send(READING, IMAGE)
         sink.send(replace(READING, number=8, margin=None, withheld="the camera moved"), None)
         assert all_sent.wait(10)
@@ -194,5 +193,5 @@ def test_a_sink_that_breaks_off_says_so_and_the_reading_goes_on(slow: Slow):
 def test_mistakes_are_told_in_a_sentence(name: str, told: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("sliplens.live.sinks._ZENOH_PATIENCE_MS", 100)
     with pytest.raises(InputError) as error:
-        open_sink(name)
+        Sender(name)
     assert told in str(error.value)

@@ -202,11 +202,10 @@ class RosGripper:
             self._publish = self._ros.publisher(f"{key}/{self._command.topic}", kind)
             self._ros.subscribe(self._topic, _STATE_KIND, self._receive)
             self._await_state(3.0)
-        except SliplensError:
-            self.close()
-            raise
         except Exception as error:  # whatever Zenoh or a package's messages raise
             self.close()
+            if isinstance(error, SliplensError):
+                raise
             raise InputError(
                 f"no gripper can be commanded at {key!r} ({error}); check the key and the kind of messages"
             ) from None

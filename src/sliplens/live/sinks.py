@@ -341,27 +341,16 @@ SINKS = Table[Callable[[str], Sink]](
 """Sinks by kind, each opened with an address; an installed package adds its own by the entry point `sliplens.sinks`."""
 
 
-def open_sink(name: str) -> Sink:
-    """Open a sink by the name of its row, and its address after a colon where it has one.
-
-    Raises
-    ------
-    InputError
-        If there is no such sink, or it cannot be opened.
-    """
-    kind, _, address = name.partition(":")
-    return SINKS.pick(kind)(address)
-
-
 _MOST_WAITING_BYTES = 64 * 2**20  # a second or two of a camera
 _READING_BYTES = 4096
 
 
 class Sender(Outlet[tuple[Reading, Frame | None]]):
-    """Outlet of readings to a sink, by its name: a slow one loses readings, and delays none."""
+    """Outlet of readings to a sink, by its row and, after a colon, its address; a slow one loses readings."""
 
     def __init__(self, name: str) -> None:
-        sink = open_sink(name)
+        kind, _, address = name.partition(":")
+        sink = SINKS.pick(kind)(address)
         super().__init__(name, send=lambda item: sink.send(*item), end=sink.close, most_bytes=_MOST_WAITING_BYTES)
 
     def add(self, reading: Reading, frame: LiveFrame | None) -> None:
@@ -372,5 +361,5 @@ class Sender(Outlet[tuple[Reading, Frame | None]]):
 
 __all__ = [
     "IMAGE_TOPIC", "READING_TOPIC", "ROS_TOPICS", "SINKS", "RerunSink", "Sender", "Sink",
-    "ZenohRos", "encode_reading", "open_sink", "parse_zenoh", "reading_schema",
+    "ZenohRos", "encode_reading", "parse_zenoh", "reading_schema",
 ]  # fmt: skip
