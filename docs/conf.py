@@ -145,7 +145,7 @@ def complete_docstring(_app: Sphinx, what: str, name: str, thing: object, _optio
             one
             for one in sorted(getattr(thing, "__all__", [name for name in vars(thing) if not name.startswith("_")]))
             if (inspect.isroutine(getattr(thing, one)) or inspect.isclass(getattr(thing, one)))
-            and getattr(getattr(thing, one), "__module__", "").startswith("sliplens")
+            and getattr(getattr(thing, one), "__module__", "").startswith(name)
         ]
         lines[:0] = [f".. rubric:: {name}", ""]
         lines += [".. autosummary::", "   :nosignatures:", "", *(f"   {one}" for one in names), ""]

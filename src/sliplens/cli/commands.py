@@ -268,8 +268,6 @@ def call_predict(call: Any, *, plot: Path | None = None) -> None:
     show_predictions(predictions)
     for reason, frames in predictions.withheld.items():
         say(f"withheld in {number_of(frames, 'frame')}: {reason}")
-    if "friction" in call.keywords:
-        say(f"margins for the given friction of {call.keywords['friction']}")
     if plot is not None:
         from sliplens.plots.figure import plot as draw
         from sliplens.plots.style import save_page

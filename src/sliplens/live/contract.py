@@ -126,6 +126,3 @@ class SourceKind:
     """Nothing runs before the source is entered."""
     takes: tuple[str, ...] = ("rate_hz", "speed", "trial", "size")
     """Options of `LiveOptions` that apply; others are refused."""
-
-
-__all__ = ["LiveOptions", "LiveSource", "SourceKind"]

@@ -219,6 +219,3 @@ class ForceStream:
             if text.strip() and not text.startswith(("#", "%")):
                 yield text.strip()
             text = ""
-
-
-__all__ = ["ForceStream", "Recorder"]

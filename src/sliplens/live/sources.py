@@ -389,8 +389,3 @@ def open_live(
             return opened
     kinds = "; ".join(kind.words for kind in SOURCES.values())
     raise InputError(f"{name} is no source that is known, nor a path that exists; name a {kinds}")
-
-
-__all__ = [
-    "SOURCES", "CameraSource", "ReplaySource", "SimulatedSource", "list_cameras", "open_live",
-]  # fmt: skip
