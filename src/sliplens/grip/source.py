@@ -1,7 +1,5 @@
 """Simulated gripper as a live source: drawn through one fingertip, and held by the predictions for its frames."""
 
-import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
@@ -16,11 +14,11 @@ from sliplens.grip.controllers import Holder
 from sliplens.grip.fingertip import Fingertip
 from sliplens.grip.gripper import GripperState
 from sliplens.grip.plant import LIFT_S, LIFTED_S, OBJECTS, PERIOD_S, Plant, World, least_force
-from sliplens.live.contract import LiveOptions, LiveSource, Pace
+from sliplens.live.contract import DrawnSource, LiveOptions
 from sliplens.live.loop import LiveReader, ReaderSettings
-from sliplens.live.reading import LiveFrame, Reading
+from sliplens.live.reading import Reading
 from sliplens.models.checkpoint import Network
-from sliplens.recordings.capture import Forces
+from sliplens.recordings.capture import Frame
 
 OPEN_S = 1.5
 """Time for which the fingers stay open at first, to show the untouched sensor, and after a drop."""
@@ -50,7 +48,7 @@ class GripStatus:
     """Last action of the controller, and its reason."""
 
 
-class GripSource(LiveSource):
+class GripSource(DrawnSource):
     """Simulated gripper that lifts an object and holds it while water is poured in, it is pulled or wetted.
 
     Its frames are those of one fingertip. The controller acts on their readings, which `LiveReader` passes on: the loop
@@ -66,8 +64,6 @@ class GripSource(LiveSource):
     >>> frame.size, source.status(frame.number).phase
     ((224, 224), 'open')
     """
-
-    simulated = True
 
     def __init__(self, object: str = "cup", controller: str = "margin", *, rate_hz: float = 30.0) -> None:
         self._object, self._tip = pick(OBJECTS, object, noun="object"), Fingertip(seed=0)
@@ -135,31 +131,16 @@ class GripSource(LiveSource):
         """Return the state of the gripper at a frame; None for a frame long ago."""
         return self._frames[number][1] if number in self._frames else None
 
-    def frames(self) -> Iterator[LiveFrame]:
-        """Draw frames of the fingertip while the gripper goes on."""
-        pace, number, rate_hz = Pace(self.closed), 0, self.rate_hz or 30.0
-        while pace.wait(number / rate_hz):
-            captured_s, time_s = time.monotonic(), number / rate_hz
-            with self._lock:
-                self._advance(time_s)
-                state = self._plant.state
-                self._frames[number] = state.time_s, self._describe(time_s)
-                self._frames.pop(number - _MEMORY, None)
-            force_n, margin = float(state.force_n[0]), float(state.margin[0, 0])
-            yield LiveFrame(
-                image=self._tip.draw(state),
-                number=number,
-                time_s=time_s,
-                captured_s=captured_s,
-                decode_ms=1e3 * (time.monotonic() - captured_s),
-                forces=Forces(
-                    time_s=np.array([time_s]),
-                    force_n=np.array([[float(state.shear_n[0, 0]), 0.0, force_n]]),
-                    source="the simulated gripper",
-                ),
-                safety_margin=margin if force_n > _FAINTEST_N and np.isfinite(margin) else None,
-            )
-            number += 1
+    def draw(self, number: int, time_s: float, /) -> tuple[Frame, tuple[float, float], float | None]:
+        """Draw a frame of the fingertip while the gripper goes on."""
+        with self._lock:
+            self._advance(time_s)
+            state = self._plant.state
+            self._frames[number] = state.time_s, self._describe(time_s)
+            self._frames.pop(number - _MEMORY, None)
+        force_n, shear_n, margin = float(state.force_n[0]), float(state.shear_n[0, 0]), float(state.margin[0, 0])
+        is_pressed = force_n > _FAINTEST_N and np.isfinite(margin)
+        return self._tip.draw(state), (force_n, shear_n), margin if is_pressed else None
 
     def _advance(self, time_s: float) -> None:
         """Step until a time; begin again some time after a drop."""

@@ -8,9 +8,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from threading import Event
 
+import numpy as np
+
 from sliplens.errors import InputError
 from sliplens.live.reading import LiveFrame, Reading
-from sliplens.recordings.capture import Frame
+from sliplens.recordings.capture import Forces, Frame
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,6 +114,34 @@ class Pace:
             return not self._closed.wait(wait_s)
         self._start_s -= wait_s
         return not self._closed.is_set()
+
+
+class DrawnSource(LiveSource):
+    """Simulated source that draws a frame at each of its times."""
+
+    simulated = True
+
+    @abstractmethod
+    def draw(self, number: int, time_s: float, /) -> tuple[Frame, tuple[float, float], float | None]:
+        """Draw the frame of a time; returns it, its normal and tangential force in newtons, and its true margin."""
+
+    def frames(self) -> Iterator[LiveFrame]:
+        """Iterate over frames at their times."""
+        pace, number, rate_hz = Pace(self.closed), 0, self.rate_hz or 30.0
+        while pace.wait(time_s := number / rate_hz):
+            captured_s = time.monotonic()
+            image, (normal_n, tangential_n), margin = self.draw(number, time_s)
+            force_n = np.array([[tangential_n, 0.0, normal_n]])
+            yield LiveFrame(
+                image=image,
+                number=number,
+                time_s=time_s,
+                captured_s=captured_s,
+                decode_ms=1e3 * (time.monotonic() - captured_s),
+                forces=Forces(time_s=np.array([time_s]), force_n=force_n, source=self.name),
+                safety_margin=margin,
+            )
+            number += 1
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,9 +18,9 @@ from jaxtyping import UInt8
 from sliplens.errors import InputError, SourceError
 from sliplens.extras import Table, pick
 from sliplens.images import natural_key
-from sliplens.live.contract import LiveOptions, LiveSource, Pace, SourceKind
+from sliplens.live.contract import DrawnSource, LiveOptions, LiveSource, Pace, SourceKind
 from sliplens.live.reading import LiveFrame
-from sliplens.recordings.capture import Capture, Forces
+from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.formats.video import upright
 from sliplens.recordings.source import open_source
 from sliplens.simulation.filming import prepare_film
@@ -217,7 +217,7 @@ _GRIP_COURSE = np.array([[0, 0.3, 1.3, 1.8, 6.8, 7.8, 8.3, 9.5], [0, 0, 1, 1, 1,
 """Grip that the simulated fingertip repeats until `load` is called: seconds, and shares of press and pull."""
 
 
-class SimulatedSource(LiveSource):
+class SimulatedSource(DrawnSource):
     """Simulated fingertip that can be pressed and pulled while it runs.
 
     Until `load` is called it repeats a grip by itself: touch, press, pull until it slips, let go.
@@ -243,13 +243,11 @@ class SimulatedSource(LiveSource):
     ((224, 224), 0.48)
     """
 
-    simulated = True
-
     def __init__(
         self, sensor: str = "chromatouch", *, friction: float = 0.775, rate_hz: float = 30.0, seed: int = 0
     ) -> None:
         chosen = pick(SENSORS, sensor, noun="simulated sensor")
-        self.name, self.rate_hz, self._step_s = f"a simulated {sensor}", rate_hz, 1 / rate_hz
+        self.name, self.rate_hz = f"a simulated {sensor}", rate_hz
         self.size = chosen.image_size_px, chosen.image_size_px
         self._rng, self._grasp = np.random.default_rng(seed), Grasp(friction=friction)
         self._forces_n: tuple[float, float] | None = None
@@ -279,27 +277,15 @@ class SimulatedSource(LiveSource):
         """Repeat the grip again."""
         self._forces_n = None
 
-    def frames(self) -> Iterator[LiveFrame]:
-        """Iterate over frames, each of the load at its time."""
-        pace, number, friction = Pace(self.closed), 0, self._grasp.friction
-        while pace.wait(time_s := number * self._step_s):
-            captured_s = time.monotonic()
-            normal_n, pull_n = self.forces_n(time_s)
-            tangential_n = min(pull_n, friction * normal_n)
-            margin = 1 - tangential_n / (friction * normal_n) if normal_n > 0 else np.nan
-            loading = load_at_margins(np.array([margin]), grasp=replace(self._grasp, normal_force_n=normal_n))
-            image = self._film.under(loading, rng=self._rng).draw(slice(0, 1)).numpy()[0]
-            force_n = np.array([[tangential_n, 0.0, normal_n]])
-            yield LiveFrame(
-                image=image,
-                number=number,
-                time_s=time_s,
-                captured_s=captured_s,
-                decode_ms=1e3 * (time.monotonic() - captured_s),
-                forces=Forces(time_s=np.array([time_s]), force_n=force_n, source="the simulated fingertip"),
-                safety_margin=float(margin) if normal_n > 0 else None,
-            )
-            number += 1
+    def draw(self, _: int, time_s: float, /) -> tuple[Frame, tuple[float, float], float | None]:
+        """Draw a frame of the load at its time."""
+        normal_n, pull_n = self.forces_n(time_s)
+        holding_n = self._grasp.friction * normal_n
+        tangential_n = min(pull_n, holding_n)
+        margin = 1 - tangential_n / holding_n if normal_n > 0 else np.nan
+        loading = load_at_margins(np.array([margin]), grasp=replace(self._grasp, normal_force_n=normal_n))
+        image = self._film.under(loading, rng=self._rng).draw(slice(0, 1)).numpy()[0]
+        return image, (normal_n, tangential_n), float(margin) if normal_n > 0 else None
 
     def forces_n(self, time_s: float) -> tuple[float, float]:
         """Return the force that presses and the one that pulls at a time, before friction limits the latter."""
