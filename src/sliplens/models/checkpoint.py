@@ -87,7 +87,8 @@ class Manifest:
 
 _BATCH = 64
 _TURN_CURE = (
-    "turn the sensor, or train on this direction with `sliplens train DATA -o RUN --augmentation all-directions`"
+    "turn the sensor, or use a network of all directions: `chromatouch-turned-pair` for a ChromaTouch, or one trained "
+    "with `sliplens train DATA -o RUN --augmentation all-directions`"
 )
 _CHANNELS_DIFFER = 0.15
 """Sum of the differences of two correlations of channels above which those in reverse order are tried."""

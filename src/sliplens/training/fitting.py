@@ -393,7 +393,7 @@ def fit(
     samples = (some.sample(_NOVELTY_FRAMES, batch_size=config.batch_size) for some in (train, validation))
     complete = replace(
         manifest,
-        trained_on=(*manifest.trained_on, *(start.manifest.trained_on if start else ())),
+        trained_on=tuple(dict.fromkeys((*manifest.trained_on, *(start.manifest.trained_on if start else ())))),
         started_from=start.manifest.weights_sha256 if start else "",
         versions=versions(),
         metrics={"validation_mse": calibration.mse},
