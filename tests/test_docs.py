@@ -12,6 +12,7 @@ import tomllib
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import wraps
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -198,6 +199,8 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("cup.mp4", "tip.mp4", "grasp.mp4", "clip.avi"):
         write_frames(folder / name, trial.frames, codec="libx264", pixels="yuv420p", stamps_ms=times_ms)
     write_forces(trial, folder / "cup.csv")
+    (folder / "trials").mkdir()
+    os.link(folder / "cup.mp4", folder / "trials/cup.mp4")
     for name, image in [("untouched", trial.reference), ("UNTOUCHED", trial.reference), ("frame", trial.frames[50])]:
         write_png(folder / f"{name}.png", image)
     pulls = [
@@ -259,9 +262,13 @@ QUICK = {"check", "recover", "predict", "track", "sensor new"}
 
 @MARKDOWN
 def test_quick_commands_of_a_page_run(page: Path, desk: Path):
+    """Left out: what takes a file of a slow command, and sensors whose frames have another size."""
+    missing = {"gelsight-mini", "fingervision", "digit"}
     for name, words in command_lines(page):
-        if name in QUICK:
+        if name in QUICK and not missing & set(words):
             typed(*name.split(), *words)
+        else:
+            missing |= {out for option, out in pairwise(words) if option == "-o"}
 
 
 def rows_of(page: str) -> list[list[str]]:
