@@ -192,8 +192,10 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     simulate_recipe(folder / "OTHER", SimulationRecipe(dry_trials=3, wet_trials=0, days=2, frames_per_trial=20, seed=9))
     write_workspace(folder / "RUNS")
     shutil.copytree(ROOT / "src/sliplens/weights/chromatouch-pair", folder / "runs/mine/train")
-    for name in ("DATA", "data", "RUN", "run"):
-        (folder / name).symlink_to("runs/mine/data" if name.lower() == "data" else "runs/mine/train")
+    links = {"runs/mine/data": ("DATA", "data"), "runs/mine/train": ("RUN", "run"), "frames": ("FRAMES", "DIFFERENCES")}
+    for target, names in links.items():
+        for name in names:
+            (folder / name).symlink_to(target)
     trial = simulate_trial(plan_trials(replace(recipe, frames_per_trial=120, release=True))[0])
     times_ms = np.round(1000 * trial.time_s).astype(int).tolist()
     for name in ("cup.mp4", "tip.mp4", "grasp.mp4", "clip.avi"):
