@@ -165,9 +165,9 @@ def test_the_pages_of_the_interface_describe_every_name_of_the_package():
     listed = re.findall(r"^\| \{py:\w+\}`~sliplens\.(\w+)`", API_PAGE, flags=re.MULTILINE)
     modules = {module.__name__.removeprefix("sliplens.") for module in MODULES}
     assert sorted(set(described) - modules) == sorted(listed) == sorted(set(sliplens.__all__) - {"__version__"})
-    # call, command, result, purpose, and the equation or algorithm, in words or by a link
-    rows = re.findall(r"^\| \{py:\w+\}.*$", API_PAGE, flags=re.MULTILINE)
-    assert all(row.count(" | ") == 4 and not row.endswith("|  |") for row in rows)
+    linked = re.findall(r"^\| \{py:\w+\}`~sliplens\.(\w+)`.*: .*\]\(.* \|$", API_PAGE, flags=re.MULTILINE)
+    plain = {"draft_corrections", "label_dataset", "load", "plot", "recover_dataset", "run_demo", "view"}
+    assert set(listed) - set(linked) == plain | {"LiveReader", "SliplensError", "StudyConfig"}  # no equation of their own
 
 
 @pytest.mark.parametrize("name", [*CALLS, "LiveReader", "StudyConfig"])
