@@ -167,7 +167,7 @@ def test_the_pages_of_the_interface_describe_every_name_of_the_package():
     assert sorted(set(described) - modules) == sorted(listed) == sorted(set(sliplens.__all__) - {"__version__"})
     linked = re.findall(r"^\| \{py:\w+\}`~sliplens\.(\w+)`.*: .*\]\(.* \|$", API_PAGE, flags=re.MULTILINE)
     plain = {"draft_corrections", "label_dataset", "load", "plot", "recover_dataset", "run_demo", "view"}
-    assert set(listed) - set(linked) == plain | {"LiveReader", "SliplensError", "StudyConfig"}  # no equation of their own
+    assert set(listed) - set(linked) == plain | {"LiveReader", "SliplensError", "StudyConfig"}  # without one
 
 
 @pytest.mark.parametrize("name", [*CALLS, "LiveReader", "StudyConfig"])
