@@ -91,7 +91,6 @@ html_theme_options = {
 html_context = {"default_mode": "auto"}
 html_sidebars = {"index": []}
 
-autodoc_default_options = {"members": True}
 autodoc_typehints = "description"
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
