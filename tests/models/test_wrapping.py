@@ -171,7 +171,7 @@ def test_what_cannot_be_wrapped_is_refused_with_its_cure(module: nn.Module, opti
         (
             lambda module: torch.ao.quantization.quantize_dynamic(module, {nn.Linear}),
             ("integrated-gradients", "shapley", "smooth-grad"),
-            "before it was quantised",
+            "before it is quantised",
         ),
     ],
     ids=["TorchScript", "quantised"],

@@ -25,6 +25,10 @@ Explainer: TypeAlias = Callable[..., Attribution]
 """Function that explains a batch, with the arguments of `Method.__call__`."""
 BATCH = 32
 """Images in a pass, which bounds the memory."""
+_NO_GRADIENT = (
+    "the model's output has no gradient; take torch.no_grad() or detach() out of its forward pass, explain a quantised "
+    "module before it is quantised, or use occlusion, which needs none"
+)
 _SLACK = 1e-6  # rounding of a resize or a division may step over 1
 _GAP = 0.01  # share of |f(x) - f(reference)| that may stay unexplained
 _LOWEST, _HIGHEST = -0.1, 1.1  # predictions of a regressor on data like its training data
@@ -67,10 +71,7 @@ class Comparison:
         """Run the network and return one margin an image, with the graph where gradients are on."""
         output = one_output(self.model(images), len(images))
         if images.requires_grad and torch.is_grad_enabled() and not output.requires_grad:
-            raise ModelError(
-                "the model's output has no gradient; take torch.no_grad() or detach() out of its forward pass, or use "
-                "occlusion, which needs none"
-            )
+            raise ModelError(_NO_GRADIENT)
         return output
 
     @cached_property
@@ -261,10 +262,7 @@ class Method(ABC):
             except RuntimeError as error:
                 if "used in the graph" not in str(error):
                     raise
-                raise ModelError(
-                    "the model's output has no gradient, such as that of a quantised module; explain the module before "
-                    "it was quantised, or use occlusion, which needs none"
-                ) from error
+                raise ModelError(_NO_GRADIENT) from error
         if attribution.relevance.is_cuda:
             torch.cuda.synchronize(attribution.relevance.device)
         return replace(attribution, method=self.method, seconds=time.perf_counter() - start)

@@ -70,7 +70,7 @@ def score_curves(
             )
         for first, second in combinations([name for name in gain if name not in controls], 2):
             gap = paired_difference(gain[first], gain[second], clusters=clusters, rng=rng)
-            comparisons.append(records.RemovalGap(**where, first=first, second=second, gap=gap))
+            comparisons.append(records.MethodGap(**where, first=first, second=second, gap=gap))
         for name, curve in of_setting.items():
             rows, steps = curve.random.size, len(curve.areas)
             tables.append(

@@ -129,19 +129,13 @@ class RemovalScore:
 
 @dataclass(frozen=True, kw_only=True)
 class MethodGap:
-    """Measure of the first method's maps less that of the second's."""
+    """Measure of the first method's maps less that of the second's, under a fill and unit if it is of removal."""
 
     first: str
     second: str
     gap: Difference
-
-
-@dataclass(frozen=True, kw_only=True)
-class RemovalGap(MethodGap):
-    """Symmetric relevance gain of the first method less that of the second, under one fill and unit."""
-
-    fill: str
-    unit: str
+    fill: str = ""
+    unit: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,7 +199,7 @@ class Faithfulness(OfOutput):
     random_orders: int
     scores: tuple[RemovalScore, ...]
     """Scores by fill, unit and method, controls included, with intervals over days and trials."""
-    comparisons: tuple[RemovalGap, ...]
+    comparisons: tuple[MethodGap, ...]
     """Gaps of every two methods under each fill and unit, with intervals of the paired difference."""
     alarms: tuple[str, ...]
     """Reasons why a score may not measure the maps."""
