@@ -166,7 +166,7 @@ def test_its_threads_have_ended_when_it_is_closed():
 def test_a_client_is_told_what_the_network_was_not_made_for(difference_run: Path):
     async def act(_: Feed, wire: Wire, __: Client) -> None:
         [doubt] = (await wire.next())["troubles"]
-        assert "reads frames of another" in doubt
+        assert "the frames are of another" in doubt
 
     with_client(act, network=difference_run, sensor=SensorProfile(name="another"))
 

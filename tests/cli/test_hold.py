@@ -29,4 +29,4 @@ def test_frames_of_another_sensor_are_told_once(small_dataset: Dataset, differen
     profile.write_text('name = "another"\n', encoding="utf-8")
     words = ("hold", small_dataset.folder, "--network", difference_run, "--engine", "torch", "--sensor", profile)
     assert run(*words, "--gripper", "dry-run", "--controller", "fixed") == 0
-    assert " ".join(capsys.readouterr().err.split()).count("reads frames of another") == 1
+    assert " ".join(capsys.readouterr().err.split()).count("the frames are of another") == 1

@@ -47,7 +47,7 @@ def test_a_video_alone_is_read_by_a_network_and_beside_a_frame_that_are_named(
     (tmp_path / "tip.toml").write_text('name = "tip"\nnetwork = "thesis-raw"\n')
     run(tmp_path / "cup.mkv", "--engine", "torch")
     alone = " ".join(capsys.readouterr().err.split())
-    assert "no network was named, so chromatouch-pair reads it, which comes with sliplens" in alone
+    assert "no network was named, so chromatouch-pair is used, which comes with sliplens" in alone
     assert "its first frame was taken for the untouched sensor" in alone
     run(tmp_path / "cup.mkv", "--engine", "torch", "--sensor", tmp_path / "tip.toml")
     known = " ".join(capsys.readouterr().err.split())

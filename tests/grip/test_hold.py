@@ -261,7 +261,7 @@ def test_a_hold_is_kept_and_no_other_takes_its_place(tmp_path: Path):
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        ({"controller": "margin"}, "needs margins, and no network reads a finger"),
+        ({"controller": "margin"}, "needs margins, and a finger has no network"),
         ({"controller": "oracle"}, "needs the true margin, which a finger does not have"),
         ({"controller": "assumed-friction"}, "needs a force sensor at the wrist"),
         ({"controller": Constant(), "settings": {"force_n": 1.0}}, "settings change a controller of the table"),

@@ -16,7 +16,7 @@ GUIDE = Path(__file__).parents[2] / "docs" / "export.md"
 
 @pytest.fixture
 def blocks() -> list[str]:
-    return re.findall(r"^```python\n(.*?)^```", GUIDE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+    return re.findall(r"^```python[^\n]*\n(.*?)^```", GUIDE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
 
 
 def test_the_file_is_read_without_sliplens(

@@ -83,7 +83,7 @@ def test_a_network_of_two_answers_takes_friction(networks: dict[str, Network], i
 
 @pytest.mark.parametrize("head", ["point", "histogram"])
 def test_a_network_of_one_answer_refuses_friction(head: str, networks: dict[str, Network], images):
-    with pytest.raises(InputError, match=r"answers with the margin alone .*ratio`"):
+    with pytest.raises(InputError, match=r"predicts the margin alone .*ratio`"):
         networks[head].estimate(images, friction=0.6)
 
 

@@ -51,20 +51,10 @@ class Command:
         aliases = [alias for name, alias in self.aliases if name == parameter]
         return ["-o", "--output"] if parameter == "out" else aliases
 
-    def refuse_early(self, words: Sequence[str]) -> None:
-        """Refuse paths that cannot be read or written before the function is imported, which may take seconds."""
-        for option, out in pairwise(words):
-            if option in {"--out", *self.names_of("out")} and self.suffixes and Path(out).suffix:
-                overwrite = "--overwrite" in words or partial_folder(Path(out)).exists()
-                require_new_file(Path(out), suffix=self.suffixes, overwrite=overwrite)
-        first, parameters = list(takewhile(lambda word: not word.startswith("-"), words)), self.definition.args
-        several = "Sequence[Path" in ast.unparse(parameters)
-        typed = [*zip(parameters.args[:1] * len(first) if several else parameters.args, first, strict=False)]
-        for parameter in (*parameters.args, *parameters.kwonlyargs):
-            options = {f"--{parameter.arg.replace('_', '-')}", *self.names_of(parameter.arg)}
-            typed += [(parameter, word) for option, word in pairwise(words) if option in options]
-        for parameter, word in typed:
-            _require_readable(parameter, word, alone=len(first) == 1)
+
+COMMANDS: dict[str, Command] = {}
+"""Commands by name; `sensor new` and the like have two words."""
+Run = Callable[..., None]
 
 
 def command(

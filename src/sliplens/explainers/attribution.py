@@ -140,14 +140,14 @@ def local_change(
     return functional.avg_pool2d(padded, 2 * reach + 1, stride=1)[0, 0]
 
 
-def lacks_float64(device: torch.device) -> bool:
-    """Return True for a device without float64, Apple's MPS."""
-    return device.type == "mps"
+def lacks_float64(values: Tensor) -> bool:
+    """Return True for values on a device without float64, Apple's MPS."""
+    return values.device.type == "mps"
 
 
 def widest(values: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """Return values in float64, or in float32 on devices that have no other."""
-    return values.float() if lacks_float64(values.device) else values.double()
+    return values.float() if lacks_float64(values) else values.double()
 
 
 def pearson_r(first: Float[Tensor, "height width"], second: Float[Tensor, "height width"]) -> float:

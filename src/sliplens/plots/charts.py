@@ -36,8 +36,8 @@ def plot_margins(rows: pa.Table, *, ax: Axes, unit: str = "margin") -> Axes:
         column(rows, name) if name in rows.column_names else nothing
         for name in ("prediction", "low_90", "high_90", "safety_margin")
     )
-    shown = (prediction, low, high, true) if of_margin else (prediction / 100, nothing, nothing, nothing)
-    _plot_prediction(across, *shown, ax=ax)
+    series = (prediction, low, high, true) if of_margin else (prediction / 100, nothing, nothing, nothing)
+    _plot_prediction(across, *series, ax=ax)
     ax.axhline(0, color=style.GREY, linewidth=0.8)
     ax.set(
         xlabel="Time (s)" if timed else "Frame", ylabel=MARGIN_LABEL if of_margin else f"Output ({unit or 'its unit'})"

@@ -128,7 +128,7 @@ def _read_header(path: Path) -> tuple[list[str], str]:
 
 def read_csv(path: Path, columns: Collection[str], *, what: str, needed: str) -> Iterator[tuple[str, dict[str, str]]]:
     """Read a table that a person wrote; yields the place of each row and its cells that are not empty, by column."""
-    (names, delimiter), seen = _read_header(path), set[str]()
+    (names, delimiter), keys = _read_header(path), set[str]()
     if unknown := [name for name in names if name not in columns]:
         raise RecordingError(f"{path} has a column {unknown[0]!r}; {what} has {', '.join(columns)}")
     try:
@@ -144,9 +144,9 @@ def read_csv(path: Path, columns: Collection[str], *, what: str, needed: str) ->
                     continue
                 if needed not in filled:
                     raise RecordingError(f"{where}: the column {needed} is empty; write one row a trial and name it")
-                if needed == "trial" and filled["trial"] in seen:
+                if needed == "trial" and filled["trial"] in keys:
                     raise RecordingError(f"{where}: {filled['trial']} has a row already; write one row a trial")
-                seen.add(filled[needed])
+                keys.add(filled[needed])
                 yield where, filled
     except (UnicodeDecodeError, csv.Error, StopIteration) as error:
         raise RecordingError(f"{path} cannot be read as CSV ({error}); export it again as UTF-8") from None

@@ -187,8 +187,8 @@ def load_profile(profile: Path | str | SensorProfile) -> SensorProfile:
 
 def is_profile(sensor: Path | str | SensorProfile) -> bool:
     """Return True for a profile, a name that looks like a file, or that of a profile that comes with sliplens."""
-    named = str(sensor) in shipped_profiles() or re.search(r"[/\\]|\.[A-Za-z]+$", str(sensor))
-    return isinstance(sensor, SensorProfile | Path) or bool(named)
+    like_a_file = re.search(r"[/\\]|\.[A-Za-z]+$", str(sensor)) is not None
+    return isinstance(sensor, SensorProfile | Path) or str(sensor) in shipped_profiles() or like_a_file
 
 
 def profile_text(profile: SensorProfile, *, notes: tuple[str, ...] = ()) -> str:

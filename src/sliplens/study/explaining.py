@@ -195,8 +195,8 @@ def _choose(
         source = load_dataset(source)
     if isinstance(source, Dataset):
         trial = facts.pop("trial")
-        if given := [name for name, fact in facts.items() if fact is not None]:
-            raise InputError(f"the trials of a data set bring their own facts; leave out {option_flags(given)}")
+        if superfluous := [name for name, fact in facts.items() if fact is not None]:
+            raise InputError(f"the trials of a data set bring their own facts; leave out {option_flags(superfluous)}")
         selection = select or FrameSelection()
         if trial is not None:
             info = source.find(trial)
