@@ -192,7 +192,7 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     simulate_recipe(folder / "OTHER", SimulationRecipe(dry_trials=3, wet_trials=0, days=2, frames_per_trial=20, seed=9))
     write_workspace(folder / "RUNS")
     shutil.copytree(ROOT / "src/sliplens/weights/chromatouch-pair", folder / "runs/mine/train")
-    links = {"runs/mine/data": ("DATA", "data"), "runs/mine/train": ("RUN", "run"), "frames": ("FRAMES", "DIFFERENCES")}
+    links = {"runs/mine/data": ("DATA", "data"), "runs/mine/train": ("RUN", "run"), "frames": ("FRAMES",)}
     for target, names in links.items():
         for name in names:
             (folder / name).symlink_to(target)
@@ -214,9 +214,12 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     states = np.concatenate([pull.frames for pull in pulls])[force_n[:, 2] > 0]
     known = {"force_n": force_n[force_n[:, 2] > 0], "untouched": pulls[0].reference}
     np.savez(folder / "states.npz", frames=states, **known)
-    (folder / "frames").mkdir()
+    for name in ("frames", "DIFFERENCES"):
+        (folder / name).mkdir()
     for number, frame in enumerate(trial.frames):
         write_png(folder / f"frames/frame-{number}.png", frame)
+        difference = np.abs(frame.astype(np.int16) - trial.reference).astype(np.uint8)
+        write_png(folder / f"DIFFERENCES/frame-{number}.png", difference)
     return folder
 
 

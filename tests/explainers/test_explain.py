@@ -95,7 +95,7 @@ def test_without_a_method_tiles_explain_where_no_markers_show_and_it_says_why(tr
 def test_frames_of_another_sensor_or_none_at_all_are_refused(trained):
     with pytest.raises(ImageError, match="frames are 64 x 32 pixels but the network was trained on 64 x 64"):
         sliplens.explain(trained("difference"), FRAMES[:, :, :32])
-    with pytest.raises(ImageError, match="there is no frame to explain"):
+    with pytest.raises(InputError, match="there is no frame; give one or more"):
         sliplens.explain(trained("difference"), FRAMES[:0])
 
 

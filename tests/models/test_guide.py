@@ -16,7 +16,8 @@ GUIDE = Path(__file__).parents[2] / "docs" / "export.md"
 
 @pytest.fixture
 def blocks() -> list[str]:
-    return re.findall(r"^```python[^\n]*\n(.*?)^```", GUIDE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+    alone = GUIDE.read_text(encoding="utf-8").partition("## Use it without sliplens")[2]
+    return re.findall(r"^```python[^\n]*\n(.*?)^```", alone, re.DOTALL | re.MULTILINE)
 
 
 def test_the_file_is_read_without_sliplens(

@@ -163,7 +163,7 @@ def test_what_cannot_be_wrapped_is_refused_with_its_cure(module: nn.Module, opti
         sl.wrap(module, **{"size": SIZE, **options})
 
 
-@pytest.mark.filterwarnings("ignore::UserWarning", "ignore::DeprecationWarning")
+@pytest.mark.filterwarnings("ignore::UserWarning", "ignore::DeprecationWarning", "ignore::FutureWarning")
 @pytest.mark.parametrize(
     ("change", "methods", "cure"),
     [
