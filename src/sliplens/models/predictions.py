@@ -272,15 +272,8 @@ def predict(
             overwrite=overwrite,
         )
     name = (written.metadata or {})[b"sliplens.engine"].decode()
-    return Predictions(
-        frames=trials.frames,
-        engine=name,
-        unit=network.manifest.unit,
-        path=path,
-        rows=rows,
-        schema=path and written,
-        notes=notes,
-    )
+    unit, schema = network.manifest.unit, path and written
+    return Predictions(frames=trials.frames, engine=name, unit=unit, path=path, rows=rows, schema=schema, notes=notes)
 
 
 def _list_notes(
