@@ -34,10 +34,6 @@ def test_finds_the_last_map_of_each_resolution_and_width(name):
     assert list(layers.values()) == list(zip(channels, sides, sides, strict=True))
 
 
-def test_finds_layers_before_functional_pooling(network, images):
-    assert list(find_layers(network("gap"), images)) == ["first", "second"]
-
-
 def test_looks_into_wrappers_and_blocks_that_shrink_repeatedly():
     class Backbone(nn.Module):
         def __init__(self) -> None:

@@ -130,15 +130,13 @@ def explain_rows(
     return MethodMaps(relevance=relevance, notes=notes)
 
 
-def explain_frames(
-    network: Network, chosen: ChosenFrames, explainers: Mapping[str, Explainer], *, warnings: Sequence[str] = ()
-) -> Explanation:
-    """Explain frames with several explainers; `warnings` are added to those of every method."""
+def explain_frames(network: Network, chosen: ChosenFrames, explainers: Mapping[str, Explainer]) -> Explanation:
+    """Explain frames with several explainers."""
     jobs, maps = list(product(explainers, chosen.batches)), {}
     for name, rows in report_each(jobs, sizes=[len(rows) for _, rows in jobs]):
         count = len(chosen.ids) * len(explainers)
         maps.setdefault(name, []).append(explain_rows(network, chosen, explainers[name], rows, maps=count))
-    return join_maps(network, chosen, maps, warnings=warnings)
+    return join_maps(network, chosen, maps)
 
 
 def join_maps(
