@@ -38,7 +38,7 @@ from sliplens.report.verdict import (
     write_ends,
 )
 from sliplens.results.faithfulness import CHANCE, DeletionCurve
-from sliplens.results.study import QUICK_METHODS, MarkerEffects, Results, StudyConfig, load_results
+from sliplens.results.study import QUICK_METHODS, MarkerEffects, Study, StudyConfig, load_results
 
 POLY_CAM, GRAD_CAM, NOISY = (f"{method}{AS_RUN}" for method in ("poly-cam", "grad-cam", "integrated-gradients"))
 """Methods as the thesis ran them: its claims are of these alone."""
@@ -105,7 +105,7 @@ def measure_shift(data: Dataset) -> tuple[tuple[ShiftPoint, ...], str]:
     return points, f"{sum(map(len, labels))} frames of {len(infos)} trials of six days"
 
 
-def judge_claims(sample: Results, held_out: Results, *, rng: np.random.Generator) -> tuple[ClaimRow, ...]:
+def judge_claims(sample: Study, held_out: Study, *, rng: np.random.Generator) -> tuple[ClaimRow, ...]:
     """Judge every claim: predictions on the test trials, maps on the training trials and, where it says so, on both."""
     rows = [*_predictions(held_out, rng), *_deletion(sample, "", rng)]
     if sample is not held_out:
@@ -117,7 +117,7 @@ def judge_claims(sample: Results, held_out: Results, *, rng: np.random.Generator
     return tuple(rows)
 
 
-def method_rows(held_out: Results) -> tuple[MethodRow, ...]:
+def method_rows(held_out: Study) -> tuple[MethodRow, ...]:
     """Rows of every method under the neutral judge."""
     return tuple(row for name in inputs_in_order(held_out.truth) for row in judge_methods(held_out.truth[name]))
 
@@ -160,7 +160,7 @@ def all_of(outcomes: Iterable[Outcome]) -> Outcome:
 # Table 1 and Fig. 7
 
 
-def _predictions(results: Results, rng: np.random.Generator) -> Iterator[ClaimRow]:
+def _predictions(results: Study, rng: np.random.Generator) -> Iterator[ClaimRow]:
     predictions = {name: evaluation.predictions for name, evaluation in results.evaluations.items()}
     scores = {name: evaluation.conditions for name, evaluation in results.evaluations.items()}
     for condition, thesis in (("dry", "0.0187 less 0.0144"), ("wet", "0.0507 less 0.0402")):
@@ -230,7 +230,7 @@ def _scores(curve: DeletionCurve, *, at: float | None) -> Float[np.ndarray, " fr
     return np.array([np.interp(at, removed, row) for row in curve.scores])
 
 
-def _deletion(results: Results, where: str, rng: np.random.Generator) -> Iterator[ClaimRow]:
+def _deletion(results: Study, where: str, rng: np.random.Generator) -> Iterator[ClaimRow]:
     curves = {name: scores.curves for name, scores in results.deletion.items()}
     for name, of_input in curves.items():
         means = {method: float(of_input[method].scores.mean()) for method in (*THREE, CHANCE)}
@@ -290,7 +290,7 @@ def _shared(first: DeletionCurve, second: DeletionCurve) -> tuple[np.ndarray, np
 # Figs. 10 and 19 to 21
 
 
-def _regions(results: Results, name: str, rng: np.random.Generator) -> Iterator[ClaimRow]:
+def _regions(results: Study, name: str, rng: np.random.Generator) -> Iterator[ClaimRow]:
     explained, curves = results.explanations[name], results.deletion[name].curves
     places = {frame.id: row for row, frame in enumerate(explained.frames)}
     left, share = {}, {}
@@ -317,7 +317,7 @@ def _regions(results: Results, name: str, rng: np.random.Generator) -> Iterator[
 # Figs. 8, 15 and 16
 
 
-def _looks(results: Results, name: str) -> Iterator[ClaimRow]:
+def _looks(results: Study, name: str) -> Iterator[ClaimRow]:
     quality = results.map_quality[name]
     resolution = {method: quality.methods[method].resolution for method in THREE}
     text = ", ".join(f"{method_name(method)} {value or 0:.2f}" for method, value in resolution.items())
@@ -357,7 +357,7 @@ def _negative(gap: Difference) -> Difference:
 # Figs. 11 and 12, and the conclusion
 
 
-def _reasoning(results: Results, name: str, rng: np.random.Generator) -> Iterator[ClaimRow]:
+def _reasoning(results: Study, name: str, rng: np.random.Generator) -> Iterator[ClaimRow]:
     truth, explained = results.truth[name], results.explanations[name]
     figure = {"difference": "Fig. 11", "raw": "Fig. 12"}[name]
     shares, half = _strongest(truth.effects)

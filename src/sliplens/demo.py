@@ -13,9 +13,9 @@ from sliplens.progress import OnProgress, open_stage, reporting
 from sliplens.recordings import Dataset
 from sliplens.report import write_report
 from sliplens.results.explanation import Strip
+from sliplens.runner import keep_record
 from sliplens.simulation.trials import simulate
 from sliplens.study.explaining import explain, make_strip
-from sliplens.study.stages import keep_record
 from sliplens.training import evaluate
 
 NETWORKS = {"difference": "thesis-difference", "raw": "thesis-raw"}

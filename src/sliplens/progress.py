@@ -48,7 +48,6 @@ class Stages(Protocol):
 
     def __call__(self, done: int, total: int, /) -> None:
         """Show how many are done, and how many there are."""
-        ...
 
     def stage(self, title: str, /) -> AbstractContextManager[OnProgress]:
         """Show a stage while it is open; gives the callback for its own progress."""
@@ -56,11 +55,9 @@ class Stages(Protocol):
 
     def wrote(self, path: Path, what: str, /, *, kept: bool = False) -> None:
         """Show what was written where, or that it was there already."""
-        ...
 
     def note(self, message: str, /) -> None:
         """Show a sentence."""
-        ...
 
 
 def fold_equal(messages: Iterable[str]) -> list[str]:

@@ -33,7 +33,7 @@ from loky import get_reusable_executor
 from loky.process_executor import BrokenProcessPool
 
 from sliplens._version import __version__
-from sliplens.codec import open_table, regrouped, write_tables
+from sliplens.codec import open_table, regrouped, save_result, write_tables
 from sliplens.errors import InputError, PartError, SliplensError
 from sliplens.extras import pick, require_packages
 from sliplens.files import (
@@ -46,7 +46,7 @@ from sliplens.files import (
     require_new_file,
     scratch_folder,
 )
-from sliplens.progress import OnProgress, counting, current_reporter, open_stage
+from sliplens.progress import OnProgress, counting, current_reporter, open_stage, report_file
 
 LONGEST = 8192
 """Largest number of frames of a part; a longer trial is divided."""
@@ -431,6 +431,17 @@ def _parts_beside(table: Path, *, resumable: bool, replaces: bool) -> Iterator[P
         remove(folder)
 
 
+def keep_record(
+    folder: Path, make: Callable[[Path], Any], *, stage: str, config: object, what: str, overwrite: bool = False
+) -> None:
+    """Keep a record in a folder, complete or absent; `make` takes the folder of parts that the next call continues."""
+    with output_folder(folder, stage=stage, config=config, overwrite=overwrite) as output:
+        if not output.complete:
+            save_result(make(output.folder / "parts"), output.folder)
+            remove(output.folder / "parts")  # not before: what fails above goes on from them
+    report_file(folder, what, kept=output.complete)
+
+
 def require_new_table(path: Path, *, suffix: str | Sequence[str], overwrite: bool = False) -> None:
     """Check that a table can be written under its name.
 
@@ -444,4 +455,4 @@ def require_new_table(path: Path, *, suffix: str | Sequence[str], overwrite: boo
     require_new_file(path, suffix=suffix, overwrite=overwrite)
 
 
-__all__ = ["Part", "Work", "part", "run_parts", "run_table"]
+__all__ = ["Part", "Work", "keep_record", "part", "run_parts", "run_table"]

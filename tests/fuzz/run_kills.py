@@ -285,8 +285,8 @@ def make_material(folder: Path) -> None:
 
 def shorten_study() -> None:
     """Take few tests, and no page (that of `grip` is one): the whole takes minutes."""
-    study.SETTINGS = study.SETTINGS[:1]
-    defaults = {"tests": ("score", "faithfulness", "truth"), "settings": study.SETTINGS, "steps": 8}
+    study.results.SETTINGS = study.results.SETTINGS[:1]
+    defaults = {"tests": ("score", "faithfulness", "truth"), "settings": study.results.SETTINGS, "steps": 8}
     StudyConfig.__init__.__kwdefaults__ = {**(StudyConfig.__init__.__kwdefaults__ or {}), **defaults}
     study.JudgingByTruth = partial(study.JudgingByTruth, pairs=2)
     sliplens.cli.commands.draw_report = lambda workspace: None  # noqa: ARG005

@@ -54,7 +54,9 @@ def test_a_gripper_that_misbehaves_holds_a_cup_by_what_is_read_of_its_frames(gri
     gripper.answer = answer
     # as the page has it, but for where the fingertip and the gripper are, and how long
     page = (Path(__file__).parents[2] / "docs" / "grip.md").read_text(encoding="utf-8")
-    [code] = re.findall(r"## Control my own gripper.*?^```python[^\n]*\n(.*?)^```", page, flags=re.DOTALL | re.MULTILINE)
+    [code] = re.findall(
+        r"## Control my own gripper.*?^```python[^\n]*\n(.*?)^```", page, flags=re.DOTALL | re.MULTILINE
+    )
     for old, new in (
         ('"0", "chromatouch-pair"', 'source, "chromatouch-pair", seconds=1.8, **given'),
         ('"tcp://gripper:5000"', "address"),

@@ -14,8 +14,8 @@ from matplotlib.patches import Rectangle
 
 from sliplens.plots import charts
 from sliplens.plots.charts import draw_strip, plot_margins
-from sliplens.report import Results, load_results
 from sliplens.results.explanation import Strip, StripReadings
+from sliplens.results.study import Study, load_results
 
 TIME_S = np.arange(6) / 10
 
@@ -72,8 +72,8 @@ def strip() -> Strip:
             contact_state=np.array(["no contact", "contact", "incipient slip", "incipient slip", "full slip"]),
             safety_margin=margin,
             prediction=np.nan_to_num(margin, nan=1.0) * 0.9,
-            low=np.nan_to_num(margin) * 0.5,
-            high=np.ones(5),
+            low_90=np.nan_to_num(margin) * 0.5,
+            high_90=np.ones(5),
             withheld=np.full(5, ""),
         ),
         shown=(1, 3),
@@ -106,7 +106,8 @@ def test_the_chart_has_units_and_marks_the_moments_with_pictures(strip):
 
 def test_a_withheld_moment_shows_no_margin_and_a_grey_chart(strip):
     gap = np.arange(5) == 3
-    values = {name: np.where(gap, np.nan, getattr(strip.readings, name)) for name in ("prediction", "low", "high")}
+    names = ("prediction", "low_90", "high_90")
+    values = {name: np.where(gap, np.nan, getattr(strip.readings, name)) for name in names}
     readings = replace(strip.readings, **values, withheld=np.where(gap, "strange; train it", ""))
     figure = draw_strip(replace(strip, readings=readings))
     titles = [ax.get_title(loc="center") for ax in figure.axes]
@@ -117,7 +118,7 @@ def test_a_withheld_moment_shows_no_margin_and_a_grey_chart(strip):
     assert "withheld: strange" in {text.get_text() for text in legend.get_texts()}
 
 
-CHARTS: dict[str, Callable[[Results, Axes], Axes]] = {
+CHARTS: dict[str, Callable[[Study, Axes], Axes]] = {
     "bins": lambda results, ax: charts.plot_bins(
         {name: each.conditions["dry"].bins for name, each in results.evaluations.items()}, ax=ax
     ),
@@ -128,7 +129,7 @@ CHARTS: dict[str, Callable[[Results, Axes], Axes]] = {
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory) -> Results:
+def results(tmp_path_factory) -> Study:
     return load_results(write_workspace(tmp_path_factory.mktemp("workspace") / "runs"))
 
 

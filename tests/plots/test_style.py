@@ -7,7 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from sliplens.errors import InputError
-from sliplens.plots.style import name_methods, percent, require_picture_path, save_page
+from sliplens.plots.style import percent, require_picture_path, save_page
 
 
 @pytest.mark.parametrize(
@@ -16,13 +16,6 @@ from sliplens.plots.style import name_methods, percent, require_picture_path, sa
 )
 def test_a_share_is_a_percentage_and_what_rounds_to_nothing_has_no_sign(value, written):
     assert percent(value) == written
-
-
-def test_methods_in_a_text_are_named_and_other_words_stay():
-    text = "poly-cam-thesis and poly-cam of integrated-gradients-like input; insertion, black: occlusion"
-    assert name_methods(text) == (
-        "Poly-CAM as in the thesis and Poly-CAM of integrated-gradients-like input; insertion, black: Occlusion"
-    )
 
 
 @pytest.mark.parametrize("name", ["page.doc", "page"])

@@ -84,7 +84,7 @@ def test_the_thesis_stands_beside_and_is_marked(text, cells):
 
 def test_warnings_and_alarms_are_shown(text):
     assert "on 3 frames the filled image is answered like the frame itself." in text
-    assert "Integrated Gradients: completeness gap 1.8 % on 2 frames." in text
+    assert "integrated-gradients: completeness gap 1.8 % on 2 frames." in text
 
 
 def test_same_results_make_the_same_page(text, complete, tmp_path):
@@ -203,7 +203,7 @@ def test_the_first_table_sets_every_method_beside_the_best_control(study_text):
 
 def test_alarms_and_the_choice_of_trials_are_on_the_page(study_text):
     assert study_text.count("the fill decides in 2 of 18 frames.") == 2
-    assert "<li>Raw images: Grad-CAM does not beat a random order: its symmetric gain is -0.050." in study_text
+    assert "<li>Raw images: grad-cam does not beat a random order: its symmetric gain is -0.050." in study_text
     assert "60 dry test trials have a frame near every level" in study_text
 
 

@@ -10,12 +10,11 @@ from matplotlib.figure import Figure
 
 import sliplens as sl
 from sliplens.codec import Result
-from sliplens.report import Results, load_results
 from sliplens.report.plates import Plate, bright_pictures, write_plates
 from sliplens.report.sections import table_scores
 from sliplens.results.evaluation import Evaluation, Training
 from sliplens.results.explanation import Strip, StripReadings
-from sliplens.results.study import RECORDS, UntrainedMaps
+from sliplens.results.study import RECORDS, Study, UntrainedMaps, load_results
 
 from .study_results import METHODS, SPEARMAN, Made, write_choice, write_faithfulness
 
@@ -38,7 +37,7 @@ def test_every_record_has_a_short_repr_a_table_and_a_figure(results, pristine_wo
     workspace = load_results(pristine_workspace)
     data = sl.simulate(dry_trials=3, wet_trials=0, days=2, frames_per_trial=20)
     untouched = UntrainedMaps(input="raw", source="simulated", maps={"grad-cam": np.ones((1, 8, 8), np.float32)})
-    margins = {name: np.arange(2.0) for name in ("time_s", "safety_margin", "prediction", "low", "high")}
+    margins = {name: np.arange(2.0) for name in ("time_s", "safety_margin", "prediction", "low_90", "high_90")}
     readings = StripReadings(contact_state=np.array(["contact"] * 2), withheld=np.array(["", ""]), **margins)
     facts = {"trial": "t", "condition": "dry", "source": "real", "input": "pair", "method": "grad-cam"}
     maps = {"pictures": np.zeros((1, 8, 8, 3), np.uint8), "relevance": np.zeros((1, 8, 8), np.float32)}
@@ -46,7 +45,7 @@ def test_every_record_has_a_short_repr_a_table_and_a_figure(results, pristine_wo
     records = [*public_records(results), *public_records(workspace), data, data.load(data.trials[0]), untouched, strip]
     kinds = {type(record) for record in records}
 
-    assert {*RECORDS.values(), Training, Evaluation, Strip, Results} <= kinds
+    assert {*RECORDS.values(), Training, Evaluation, Strip, Study} <= kinds
     for record in {type(record): record for record in reversed(records)}.values():
         assert len(repr(record).splitlines()) <= 10, record
         assert max(map(len, repr(record).splitlines())) <= 280

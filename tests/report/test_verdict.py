@@ -17,7 +17,7 @@ from sliplens.report import load_results, verdict
 from sliplens.report.sections import build_opening, build_sections
 from sliplens.report.verdict import compare_errors, judge_accuracy, judge_results
 from sliplens.results.evaluation import RegressionScores, ScoredFrames
-from sliplens.results.study import Results
+from sliplens.results.study import Study
 
 from .study_results import GAINS, MAP_MEASURES, SPEARMAN, Made, edit, write_choice, write_study
 
@@ -107,7 +107,7 @@ def test_too_few_trials_decide_nothing_and_one_has_no_interval():
     assert verdict.write_gap(gap) == "+1.000 (no interval of one trial)"
 
 
-def status(results: Results) -> dict[tuple[str, str], str]:
+def status(results: Study) -> dict[tuple[str, str], str]:
     return {(row.input, row.method): row.status for row in verdict.judge_study(results)}
 
 
@@ -139,7 +139,7 @@ def test_a_fill_votes_once_and_not_where_it_cannot_tell_the_truth(made):
     assert verdict.voting_settings(faithful, replace(truth, meta=(meta, unsure))) == [every[0], *every[2:]]
 
 
-def with_r2(results: Results, r2: float) -> Results:
+def with_r2(results: Study, r2: float) -> Study:
     """The same, with a raw network of this R2 on dry test trials."""
     evaluation = results.evaluations["raw"]
     dry = replace(evaluation.conditions["dry"], r2=r2)

@@ -31,13 +31,21 @@ def plot_margins(rows: pa.Table, *, ax: Axes, unit: str = "margin") -> Axes:
     timed = "time_s" in rows.column_names and rows["time_s"].null_count == 0
     across = column(rows, "time_s" if timed else "frame")
     _shade_withheld(across, rows["withheld"].to_pylist(), ax=ax)
-    nothing, of_margin = np.full(len(rows), np.nan), unit == "margin"
+    of_margin = unit == "margin"
     prediction, low, high, true = (
-        column(rows, name) if name in rows.column_names else nothing
+        100 * column(rows, name) if name in rows.column_names else np.full(len(rows), np.nan)
         for name in ("prediction", "low_90", "high_90", "safety_margin")
     )
-    series = (prediction, low, high, true) if of_margin else (prediction / 100, nothing, nothing, nothing)
-    _plot_prediction(across, *series, ax=ax)
+    if not of_margin:
+        prediction, low, high, true = prediction / 100, *3 * [np.full(len(rows), np.nan)]
+    if np.isfinite(low).any():  # a network that was never calibrated has none
+        ax.fill_between(across, low, high, color=style.BLUE, alpha=0.18, linewidth=0, label="90 % interval")
+    # few frames have a dot each: one alone makes no line
+    dot = "o" if len(across) <= 40 else ""
+    if np.isfinite(prediction).any():
+        ax.plot(across, prediction, color=style.BLUE, marker=dot, markersize=3, label="predicted")
+    if np.isfinite(true).any():
+        ax.plot(across, true, color=style.BLACK, linestyle="--", label="true")
     ax.axhline(0, color=style.GREY, linewidth=0.8)
     ax.set(
         xlabel="Time (s)" if timed else "Frame", ylabel=MARGIN_LABEL if of_margin else f"Output ({unit or 'its unit'})"
@@ -48,8 +56,9 @@ def plot_margins(rows: pa.Table, *, ax: Axes, unit: str = "margin") -> Axes:
     if of_margin:
         ax.set_ylim(min(low, -4), max(high, 104))
     ax.legend(loc="lower left", bbox_to_anchor=(0.0, 0.99), ncols=2, borderaxespad=0.2)
-    lines = -(-len(ax.get_legend_handles_labels()[0]) // 2)
-    ax.set_title(rows["trial"][0].as_py(), parse_math=False, pad=6 + 15 * lines)
+    if "trial" in rows.column_names:
+        lines = -(-len(ax.get_legend_handles_labels()[0]) // 2)
+        ax.set_title(rows["trial"][0].as_py(), parse_math=False, pad=6 + 15 * lines)
     return ax
 
 
@@ -93,12 +102,7 @@ def draw_strip(strip: Strip) -> Figure:
 def plot_readings(strip: Strip, *, ax: Axes) -> Axes:
     """Draw the true and the predicted margin over time, with the interval and the moments of the pictures."""
     readings, time_s = strip.readings, strip.readings.time_s
-    touched = np.isfinite(readings.safety_margin)
-    _shade_withheld(time_s, readings.withheld.tolist(), ax=ax)
-    prediction, low, high = (
-        np.where(touched, value, np.nan) for value in (readings.prediction, readings.low, readings.high)
-    )
-    _plot_prediction(time_s, prediction, low, high, readings.safety_margin, ax=ax)
+    plot_margins(readings.where(np.isfinite(readings.safety_margin)).to_arrow(), ax=ax)
     for number, frame in enumerate(strip.shown, start=1):
         ax.axvline(time_s[frame], color="#9CA3AF", linewidth=0.8, zorder=0)
         ax.annotate(str(number), (time_s[frame], 106), ha="center", fontsize=9, annotation_clip=False)
@@ -106,7 +110,7 @@ def plot_readings(strip: Strip, *, ax: Axes) -> Axes:
     if slipping.any():
         ends = float(time_s[slipping][0]), float(time_s[-1])
         ax.axvspan(*ends, color=style.VERMILLION, alpha=0.15, linewidth=0, label="from the first full slip")
-    ax.set(xlabel="Time (s)", ylabel=MARGIN_LABEL, ylim=(-4, 104), xlim=(time_s[0], time_s[-1]))
+    ax.set(ylim=(-4, 104), xlim=(time_s[0], time_s[-1]))
     ax.legend(loc="lower left")
     return ax
 
@@ -127,49 +131,29 @@ def _shade_withheld(across: Float[np.ndarray, " frames"], reasons: Sequence[str 
         labels.add(label)
 
 
-def _plot_prediction(
-    across: np.ndarray, prediction: np.ndarray, low: np.ndarray, high: np.ndarray, true: np.ndarray, *, ax: Axes
-) -> None:
-    """Draw shares in percent: a prediction with its interval, and the label; each where it has any number."""
-    if np.isfinite(low).any():  # a network that was never calibrated has none
-        ax.fill_between(across, 100 * low, 100 * high, color=style.BLUE, alpha=0.18, linewidth=0, label="90 % interval")
-    # few frames have a dot each: one alone makes no line
-    dot = "o" if len(across) <= 40 else ""
-    if np.isfinite(prediction).any():
-        ax.plot(across, 100 * prediction, color=style.BLUE, marker=dot, markersize=3, label="predicted")
-    if np.isfinite(true).any():
-        ax.plot(across, 100 * true, color=style.BLACK, linestyle="--", label="true")
-
-
-def plot_grip_force(trace: pa.Table, *, ax: Axes) -> Axes:
-    """Draw the grip force over the least force that holds, and detected slips."""
-    time_s, force_n, least_n = (column(trace, name) for name in ("time_s", "force_n", "least_force_n"))
+def plot_grip_force(rows: pa.Table, *, ax: Axes) -> Axes:
+    """Draw the grip force over the least that holds or beside its command, slips, and faults of the gripper."""
+    time_s, force_n, command_n = (column(rows, name) for name in ("time_s", "force_n", "command_n"))
+    simulated = "least_force_n" in rows.column_names
+    line_n = column(rows, "least_force_n") if simulated else command_n
+    ax.plot(time_s, line_n, color=style.BLACK, linestyle="--", label="least that holds" if simulated else "commanded")
     ax.plot(time_s, force_n, color=style.BLUE, label="grip force")
-    ax.plot(time_s, least_n, color=style.BLACK, linestyle="--", label="least that holds")
-    ax.fill_between(time_s, least_n, force_n, color=style.BLUE, alpha=0.12, linewidth=0)
-    for number, slip_s in enumerate(time_s[column(trace, "slip_seen") > 0]):
-        ax.axvline(
-            slip_s, color=style.VERMILLION, linewidth=1, linestyle=":", label="slip detected" if number == 0 else None
-        )
+    level_n = np.where(np.isnan(force_n), command_n, force_n)  # a gripper that failed measures nothing
+    for name, colour, label in _EVENTS:
+        if name in rows.column_names and (marked := column(rows, name) > 0).any():
+            ax.plot(time_s[marked], level_n[marked], color=colour, marker="x", linestyle="", label=label)
     # room for the legend above the lines
-    ax.set(xlabel="Time (s)", ylabel="Force (N)", ylim=(0, 1.4 * float(force_n.max()) or 1.0))
+    top = 1.4 * float(np.fmax(level_n, line_n).max(initial=0.0)) or 1.0
+    ax.set(xlabel="Time (s)", ylabel="Grip force (N)", ylim=(0, top))
     ax.legend(loc="upper right", ncols=2)
     return ax
 
 
-def plot_hold(steps: pa.Table, *, ax: Axes) -> Axes:
-    """Draw the commanded and the measured grip force, slips, and faults of the gripper."""
-    time_s, command_n = column(steps, "time_s"), column(steps, "command_n")
-    ax.plot(time_s, command_n, color=style.BLACK, linestyle="--", label="commanded")
-    ax.plot(time_s, column(steps, "force_n"), color=style.BLUE, label="measured")
-    for name, colour, label in (("slip", style.VERMILLION, "slip detected"), ("failed", style.GREY, "gripper failed")):
-        marked = column(steps, name) > 0
-        ax.plot(time_s[marked], command_n[marked], color=colour, marker="x", linestyle="", label=label)
-    ax.set(xlabel="Time (s)", ylabel="Grip force (N)", ylim=(0, 1.4 * float(command_n.max(initial=0.0)) or 1.0))
-    ax.legend(loc="upper right", ncols=2)
-    return ax
-
-
+_EVENTS = (
+    ("slip_seen", style.VERMILLION, "slip detected"),
+    ("slip", style.VERMILLION, "slip detected"),
+    ("failed", style.GREY, "gripper failed"),
+)
 _MSE_LABEL, _EPOCH_LABEL = "MSE (Γ as a fraction, squared)", "Epoch (passes over the training frames)"
 
 

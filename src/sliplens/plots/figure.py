@@ -96,9 +96,7 @@ def _explanation(explanation: Explanation, ax: Axes, index: int | None) -> None:
     ax.imshow(overlay_points([explanation.pictures[row]], relevance, scale=scale)[0])
     ax.set(xticks=[], yticks=[])
     ax.spines[:].set_visible(False)
-    figure = ax.get_figure(root=True)
-    assert figure is not None
-    bar = figure.colorbar(ScalarMappable(Normalize(-full, full), SIGN_COLOURS), ax=ax, shrink=0.9)
+    bar = ax.figure.colorbar(ScalarMappable(Normalize(-full, full), SIGN_COLOURS), ax=ax, shrink=0.9)
     bar.set_label(f"orange lowers the prediction, blue raises it\n({unit})", fontsize=8)
     bar.ax.tick_params(labelsize=8)
     predicted = "withheld" if frame.withheld else style.amount(frame.prediction, explanation.unit)
@@ -139,9 +137,7 @@ def _truth(truth: Truth, ax: Axes, _: int | None) -> None:
 
 def _untrained(record: UntrainedMaps, ax: Axes, index: int | None) -> None:
     name, maps = next(iter(record.maps.items()))
-    figure = ax.get_figure(root=True)
-    assert figure is not None
-    figure.colorbar(ax.imshow(maps[index or 0], cmap="gray"), ax=ax, label="relevance in the output's unit")
+    ax.figure.colorbar(ax.imshow(maps[index or 0], cmap="gray"), ax=ax, label="relevance in the output's unit")
     ax.set_title(style.method_name(name))
 
 
@@ -236,7 +232,7 @@ DRAWERS: dict[str, Callable[[Any, Axes, int | None], object]] = {
     "ScoredFrames": lambda result, ax, index: charts.plot_margins(_rows_of_trial(result.to_arrow(), index), ax=ax),
     "Tracking": _tracking,
     "Grip": lambda of, ax, _: charts.plot_grip_force(of.trace.to_arrow(), ax=ax).set_title(of.setup.controller),
-    "Hold": lambda result, ax, _: charts.plot_hold(result.steps.to_arrow(), ax=ax).set_title(result.controller),
+    "Hold": lambda result, ax, _: charts.plot_grip_force(result.steps.to_arrow(), ax=ax).set_title(result.controller),
     "Recording": lambda result, ax, _: plot_margin(result, ax=ax).set_title(result.trial, parse_math=False),
     "Strip": lambda result, ax, _: charts.plot_readings(result, ax=ax),
 }

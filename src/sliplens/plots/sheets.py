@@ -8,7 +8,6 @@ from textwrap import wrap
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
@@ -21,7 +20,7 @@ from sliplens.progress import OnProgress, open_stage, report_each, reporting
 from sliplens.recordings import ContactState, Dataset, Recording
 from sliplens.recordings.dataset import trial_path
 from sliplens.recordings.labelling import FrictionEstimate, LabelBasis, Labelling
-from sliplens.recordings.store import load_recording, read_frames, read_header
+from sliplens.recordings.store import load_recording, read_frames
 from sliplens.results.explanation import MARGIN_LEVELS
 
 STATE_COLOURS = dict(zip(ContactState, (style.GREY, style.BLUE, style.ORANGE, style.VERMILLION, "white"), strict=True))
@@ -180,21 +179,18 @@ def draw_audit(recording: Recording, labelling: Labelling, *, read_frames: ReadF
 
 def write_audits(data: Dataset, folder: Path, *, on_progress: OnProgress | None = None) -> int:
     """Draw the audit of every trial, `TRIAL.png`, unless a newer page is there; returns the number of new pages."""
-    for info in data.trials:
-        if read_header(trial_path(data.folder, info.trial)).labelling is None:
-            raise InputError(
-                f"{info.trial} of {data.folder} was not imported, so the origin of its labels is unknown; "
-                "label it into a new folder with --output"
-            )
     drawn = 0
-    folder.mkdir(parents=True, exist_ok=True)
     with reporting(on_progress), open_stage("Drawing pages"):
         for info in report_each(data.trials):
             path, page = trial_path(data.folder, info.trial), folder / f"{info.trial}.png"
             if not page.is_file() or page.stat().st_mtime_ns < path.stat().st_mtime_ns:
                 # without pixels but those on the page: a long trial needs little memory
                 recording = load_recording(path, pixels=False)
-                assert recording.labelling is not None
+                if recording.labelling is None:
+                    raise InputError(
+                        f"{info.trial} of {data.folder} was not imported, so the origin of its labels is unknown; "
+                        "label it into a new folder with --output"
+                    )
                 save_page(draw_audit(recording, recording.labelling, read_frames=partial(read_frames, path)), page)
                 drawn += 1
     return drawn
@@ -215,21 +211,19 @@ def _draw_charts(figure: Figure, recording: Recording, labelling: Labelling, fra
     _plot_forces(recording, basis, ax=charts[0])
     _plot_ratio(recording, basis and basis.friction, ax=charts[1])
     _plot_labels(recording, ax=charts[2])
+    states = [Patch(lw=0, label=each, color=STATE_COLOURS[each], alpha=STATE_TINTS[each]) for each in _NAMED]
     for ax in charts:
-        handles: list[Artist] = [*ax.get_legend_handles_labels()[0]]
-        if ax is charts[2]:
-            handles += [Patch(lw=0, label=each, color=STATE_COLOURS[each], alpha=STATE_TINTS[each]) for each in _NAMED]
+        once = "" if ax is charts[1] else "_"  # equal entries are written once
         if basis is not None and basis.slip_s is not None:
             shift = lag.lag_s if lag and basis.lag_applied else 0.0
-            slips_s = [basis.slip_s, *basis.friction.later_onsets_s]
-            lines = [ax.axvline(at_s + shift, color=BLACK, ls="-.", lw=1.3, label="_slip") for at_s in slips_s]
-            lines[0].set_label(f"slip at {slips_s[0] + shift:.2f} s")
-            entries: list[Artist] = [*lines[:1]]
+            for number, at_s in enumerate([basis.slip_s, *basis.friction.later_onsets_s]):
+                label = "_later" if number else f"{once}slip at {at_s + shift:.2f} s"
+                ax.axvline(at_s + shift, color=BLACK, ls="-.", lw=1.3, label=label)
             if lag is not None and not lag.doubt:
                 ends_s = basis.slip_s + lag.lag_s + np.array([-1, 1]) * lag.sigma_s
-                entries.append(ax.axvspan(*ends_s, color=SKY, alpha=0.6, lw=0, zorder=0))
-                entries[-1].set_label(r"as the camera sees it (lag $\pm\,\sigma$)")
-            handles += entries if ax is charts[1] else []  # equal entries are written once
+                label = rf"{once}as the camera sees it (lag $\pm\,\sigma$)"
+                ax.axvspan(*ends_s, color=SKY, alpha=0.6, lw=0, zorder=0, label=label)
+        handles = [*ax.get_legend_handles_labels()[0], *(states if ax is charts[2] else [])]
         for at in frames:
             ax.axvline(recording.time_s[at], color=BLACK, lw=0.7, alpha=0.45, zorder=1, label="_frame")
         place = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.1, "borderpad": 0}

@@ -2,7 +2,6 @@
 
 import base64
 import io
-import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -128,12 +127,6 @@ def methods_in_order(names: Iterable[str]) -> list[str]:
     methods = [*EXPLAINERS, *CONTROL_NAMES]
     order = [*methods, *(name + NEW_WEIGHTS for name in methods)]
     return sorted(in_order(set(names), order), key=is_control)
-
-
-def name_methods(text: str) -> str:
-    """Replace the keys of methods in a text by display names, except of controls, whose keys are common words."""
-    keys = sorted(EXPLAINERS, key=len, reverse=True)
-    return re.sub(rf"(?<![\w-])(?:{'|'.join(keys)})(?![\w-])", lambda key: EXPLAINERS[key[0]].title, text)
 
 
 def fill_name(fill: str, unit: str = "pixel") -> str:

@@ -18,7 +18,7 @@ from sliplens.plots.style import percent, reading_words
 from sliplens.report.verdict import ThesisRecord, scores_by_condition
 from sliplens.results.explanation import BASELINES, Explanation, MovedMarkers, Strip
 from sliplens.results.faithfulness import DeletionScores, is_control
-from sliplens.results.study import Results
+from sliplens.results.study import Study
 
 FOLDER = "figures"
 """Beside the page."""
@@ -129,7 +129,7 @@ def plate_moved(strip: Strip, moved: MovedMarkers) -> Plate:
     )
 
 
-def plate_bins(results: Results) -> Plate:
+def plate_bins(results: Study) -> Plate:
     """Draw the MSE by bins of the margin, a chart a condition (thesis, Fig. 7)."""
     bins = {
         condition: {name: score.bins for name, score in scores.items()}
@@ -211,7 +211,7 @@ def plate_deletion(scores: Mapping[str, DeletionScores]) -> Plate:
     )
 
 
-def plate_states(results: Results, explained: Explanation) -> Plate:
+def plate_states(results: Study, explained: Explanation) -> Plate:
     """Draw every method across the states of one trial (thesis, Figs. 15 and 16)."""
     rows = frames_by_margin(results, explained)
     frames = [explained.frames[row] for row in rows]
@@ -244,7 +244,7 @@ def plate_states(results: Results, explained: Explanation) -> Plate:
     )
 
 
-def frames_by_margin(results: Results, explained: Explanation) -> list[int]:
+def frames_by_margin(results: Study, explained: Explanation) -> list[int]:
     """Numbers of the frames to show: those of the study's choice, else a few of one condition; the margin falls."""
     places = {frame.id: index for index, frame in enumerate(explained.frames)}
     choice = results.choice

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 from sliplens.plots import style
-from sliplens.plots.style import fill_name, input_name, inputs_in_order, listed, name_methods
+from sliplens.plots.style import fill_name, input_name, inputs_in_order, listed
 from sliplens.report import plates, verdict
 from sliplens.results.explanation import BASELINES
 from sliplens.results.faithfulness import DeletionScores, Faithfulness, RemovalScore, is_control
-from sliplens.results.study import TESTS, Results
+from sliplens.results.study import TESTS, Study
 
 Kind = Literal["name", "number", "best", "thesis", "outcome"]
 
@@ -103,7 +103,7 @@ def table_claims(caption: str, rows: Sequence[verdict.ClaimRow]) -> CellTable:
     return make_table(caption, heads, cells, names=3, wrap=True)
 
 
-def table_accuracy(results: Results) -> CellTable:
+def table_accuracy(results: Study) -> CellTable:
     """Tabulate MSE, R2 and MAE by condition and input (thesis, Table 1)."""
     evaluations, rows = results.evaluations, []
     for condition, scores in verdict.scores_by_condition(results).items():
@@ -178,7 +178,7 @@ def _gain_cell(score: RemovalScore | None) -> Cell:
     return _best(text, lead is not None and lead.gap.above_zero)
 
 
-def table_properties(results: Results) -> CellTable:
+def table_properties(results: Study) -> CellTable:
     """Tabulate what the maps of each method look like, and what they cost."""
     rows = []
     for name in style.inputs_in_order(results.map_quality):
@@ -225,7 +225,7 @@ class Opening:
     next_step: str
 
 
-def build_opening(results: Results, rows: Sequence[verdict.MethodRow]) -> Opening:
+def build_opening(results: Study, rows: Sequence[verdict.MethodRow]) -> Opening:
     """Build the first page from the study of a workspace, or from that of the package where it holds none."""
     strip = results.strip
     answer, reasons = "Not known: no explanation was scored yet.", []
@@ -257,14 +257,13 @@ class Section:
 
     id: str
     title: str
-    short_title: str
     intro: str
     blocks: Sequence[Block]
     step: str = ""
     """Step of a study that makes its results, named on the page where it was not run; empty where no study has it."""
 
 
-def build_sections(results: Results) -> tuple[Section, ...]:
+def build_sections(results: Study) -> tuple[Section, ...]:
     """Build the sections in the order they are read; those whose results are not there have no block."""
     explained = (results.explanations | results.real).values()
     baseline = next((BASELINES[each.baseline] for each in explained), BASELINES["untouched"])
@@ -275,14 +274,12 @@ def build_sections(results: Results) -> tuple[Section, ...]:
         Section(
             id="real",
             title="Real touch",
-            short_title="Real touch",
             intro="Frames of a real sensor, shown to each network.",
             blocks=[plates.plate_states(results, results.real[name]) for name in _names(results.real)],
         ),
         Section(
             id="accuracy",
-            title="How well the safety margin is predicted",
-            short_title="Accuracy",
+            title="Accuracy",
             intro="Each network predicts trials that it was not trained on (Table 1 and Fig. 7 of the thesis, for this "
             "data). A raw image is the camera's frame; a difference image is that frame against the untouched sensor; "
             "in an image pair both stand side by side.",
@@ -291,8 +288,7 @@ def build_sections(results: Results) -> tuple[Section, ...]:
         ),
         Section(
             id="faithfulness",
-            title="How far the explanations can be believed",
-            short_title="Faithfulness",
+            title="Faithfulness",
             intro="Parts of a frame are removed: the most supporting first, the least supporting first, and at random. "
             f"With a faithful map the prediction returns to that of {baseline} at once in the first case, and not "
             "in the second. Controls are maps that use nothing the network learned. The thesis's score beside it: D = "
@@ -306,8 +302,7 @@ def build_sections(results: Results) -> tuple[Section, ...]:
         ),
         Section(
             id="maps",
-            title="Where each network looks, and what the maps look like",
-            short_title="Saliency maps",
+            title="Saliency maps",
             intro="From full stick (Γ 100 %) to the onset of full slip (Γ 0 %): why each network predicts its margin "
             f"rather than that of {baseline}. The thesis judged the maps by eye; a study measures the same.",
             blocks=[
@@ -318,8 +313,7 @@ def build_sections(results: Results) -> tuple[Section, ...]:
         ),
         Section(
             id="choice",
-            title="Which trials were taken",
-            short_title="Trials",
+            title="Trials",
             intro="The trials and frames that are explained and scored.",
             blocks=[
                 *([results.choice.summary] if results.choice else []),
@@ -330,8 +324,7 @@ def build_sections(results: Results) -> tuple[Section, ...]:
         ),
         Section(
             id="claims",
-            title="The claims of the thesis",
-            short_title="Claims",
+            title="Claims",
             intro="From a study of the two networks that come with sliplens, one an input, on simulated trials of "
             "their sensor: not of this workspace. A claim holds or not beyond the interval; otherwise it is open.",
             blocks=[table_claims(f"{claims} {thesis.sample}", thesis.claims)] if thesis else [],
@@ -339,11 +332,11 @@ def build_sections(results: Results) -> tuple[Section, ...]:
     )
 
 
-def missing_sections(results: Results, sections: Sequence[Section]) -> list[str]:
-    """Short titles of the sections of a study that was asked for them and has not made them."""
+def missing_sections(results: Study, sections: Sequence[Section]) -> list[str]:
+    """Titles of the sections of a study that was asked for them and has not made them."""
     left_out = set(TESTS) - set(results.config.tests) if results.config else set()
     wanted = [each for each in sections if each.step and each.step not in left_out] if results.begun else []
-    return [each.short_title for each in wanted if not each.blocks]
+    return [each.title for each in wanted if not each.blocks]
 
 
 def _names(names: Iterable[str]) -> list[str]:
@@ -351,7 +344,7 @@ def _names(names: Iterable[str]) -> list[str]:
     return inputs_in_order(names)[::-1]
 
 
-def list_alarms(results: Results) -> list[str]:
+def list_alarms(results: Study) -> list[str]:
     """Sentences on what puts results in doubt, each once, in the order of the networks."""
     alarms = [*results.notes, *(results.states.untracked if results.states else ())]
     if len({tuple(sorted(run.versions.items())) for run in results.runs.values()}) > 1:
@@ -365,5 +358,5 @@ def list_alarms(results: Results) -> list[str]:
         if unfit := [fill_name(test.fill) for test in (truth.meta if truth else ()) if not test.holds]:
             why = "a map of the Shapley values does not gain more than the same map with half of the markers shuffled"
             texts.append(f"under {listed(unfit)} {why}, so that this fill has no vote")
-        alarms += [f"{input_name(name)}: {name_methods(text).rstrip('.')}." for text in texts]
+        alarms += [f"{input_name(name)}: {text.rstrip('.')}." for text in texts]
     return list(dict.fromkeys(alarms))

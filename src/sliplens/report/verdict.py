@@ -23,7 +23,7 @@ from sliplens.plots import style
 from sliplens.progress import number_of
 from sliplens.results.evaluation import RegressionScores, ScoredFrames
 from sliplens.results.faithfulness import Faithfulness
-from sliplens.results.study import CLOSE_TO_LABELS, TABLES, Results, Truth
+from sliplens.results.study import CLOSE_TO_LABELS, TABLES, Study, Truth
 
 CITATION = (
     "Max Polak, Explainable Neural Networks for Incipient Slip Sensing in Robot Tactile Learning, Master's thesis, "
@@ -152,7 +152,7 @@ def judge_gap(gap: Difference | None) -> Outcome:
     return "holds" if gap.estimate > 0 else "does not hold"
 
 
-def scores_by_condition(results: Results) -> dict[str, dict[str, RegressionScores]]:
+def scores_by_condition(results: Study) -> dict[str, dict[str, RegressionScores]]:
     """Scores of the networks on test trials by condition and input, in the order they are read."""
     scores = {name: results.evaluations[name].conditions for name in style.inputs_in_order(results.evaluations)}
     conditions = style.conditions_in_order(condition for each in scores.values() for condition in each)
@@ -165,14 +165,14 @@ def scores_by_condition(results: Results) -> dict[str, dict[str, RegressionScore
 # can these maps be trusted?
 
 
-def test_r2(results: Results, name: str) -> float | None:
+def test_r2(results: Study, name: str) -> float | None:
     """R2 of a network on test trials of the study's condition; None where it was not evaluated."""
     evaluation, condition = results.evaluations.get(name), results.choice.condition if results.choice else "dry"
     score = evaluation and evaluation.conditions.get(condition)
     return score.r2 if score else None
 
 
-def without_weak(results: Results) -> tuple[Results, tuple[str, ...]]:
+def without_weak(results: Study) -> tuple[Study, tuple[str, ...]]:
     """Leave out maps of networks that predict too badly to be explained, and say so."""
     scores = {name: test_r2(results, name) for name in results.evaluations}
     weak = [name for name, r2 in scores.items() if r2 is not None and r2 < SHOWN_R2]
@@ -192,7 +192,7 @@ def without_weak(results: Results) -> tuple[Results, tuple[str, ...]]:
     return replace(results, strip=strip, **tables), (text,)
 
 
-def why_no_verdict(results: Results, name: str) -> str | None:
+def why_no_verdict(results: Study, name: str) -> str | None:
     """Reason why the maps of a network get no verdict; None where they may."""
     r2, choice = test_r2(results, name), results.choice
     if r2 is not None and r2 < LEAST_R2:
@@ -206,7 +206,7 @@ def why_no_verdict(results: Results, name: str) -> str | None:
     return None
 
 
-def judge_study(results: Results) -> tuple[MethodRow, ...]:
+def judge_study(results: Study) -> tuple[MethodRow, ...]:
     """Judge the methods of all networks: by the neutral truth where the scene can be drawn again, else by removal."""
     rows: list[MethodRow] = []
     for name in style.inputs_in_order({*results.truth, *results.faithfulness})[::-1]:
@@ -280,7 +280,7 @@ def answer_trust(rows: Sequence[MethodRow], reasons: Iterable[str | None] = ()) 
     return " ".join(answer)
 
 
-def cautions(results: Results) -> tuple[str, ...]:
+def cautions(results: Study) -> tuple[str, ...]:
     """Return what limits every row of the verdict: few trials, an unsound sample."""
     choice, sentences = results.choice, []
     if choice is not None and len(choice.trials) < FEWEST_UNITS:
@@ -303,12 +303,12 @@ def judge_accuracy(score: RegressionScores) -> Outcome:
     return "holds" if score.r2 > 0 else "does not hold"
 
 
-def judge_results(results: Results, *, rng: np.random.Generator) -> tuple[ClaimRow, ...]:
+def judge_results(results: Study, *, rng: np.random.Generator) -> tuple[ClaimRow, ...]:
     """Compare the errors of the networks of a workspace, and judge how they predict real touch."""
     return *_judge_networks(results, rng=rng), *_judge_real_touch(results)
 
 
-def _judge_networks(results: Results, *, rng: np.random.Generator) -> Iterator[ClaimRow]:
+def _judge_networks(results: Study, *, rng: np.random.Generator) -> Iterator[ClaimRow]:
     evaluations = results.evaluations
     scores = {name: evaluations[name].conditions for name in style.inputs_in_order(evaluations)}
     for pair in combinations(scores, 2):
@@ -326,7 +326,7 @@ def _judge_networks(results: Results, *, rng: np.random.Generator) -> Iterator[C
             )
 
 
-def _judge_real_touch(results: Results) -> Iterator[ClaimRow]:
+def _judge_real_touch(results: Study) -> Iterator[ClaimRow]:
     real = results.real or (results.explanations if results.source == "real" else {})
     for name in style.inputs_in_order(real):
         frames = [frame for frame in real[name].frames if frame.safety_margin is not None]

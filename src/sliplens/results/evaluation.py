@@ -138,8 +138,6 @@ class LeadTimes:
     """From the first true alarm to the slip, over the warned trials; None if there is none."""
     false_per_minute: Annotated[float, AMOUNT]
     """Alarms that begin while the true margin is above twice the threshold, by the minute of labelled touch."""
-    threshold: Annotated[float, MARGIN]
-    """Margin below which a prediction is an alarm, in margin units."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,17 +164,13 @@ class ScoredFrames(Columns):
 
 @dataclass(frozen=True, kw_only=True)
 class RiskCoverage:
-    """Error of what is answered against the share that is: what a network gains by saying "I do not know"."""
+    """Mean absolute errors, in margin units: what a network gains by saying "I do not know"."""
 
-    covered: tuple[Annotated[float, SHARE], ...]
-    """Shares of the frames that are answered, from 1 down."""
-    error: dict[str, tuple[Annotated[float, AMOUNT], ...]]
-    """Mean absolute error at each share, in margin units, by what is withheld first: `known`, what is least like the
-    training (`Estimate.known`); `spread`, the widest distributions; `perfect`, the largest errors (unknown in use)."""
-
-    def error_at(self, reason: str, share: float) -> float:
-        """Mean absolute error while a share of the frames is answered, in margin units."""
-        return self.error[reason][self.covered.index(share)]
+    whole: Annotated[float, AMOUNT]
+    """Of all frames."""
+    error: dict[str, Annotated[float, AMOUNT]]
+    """Without a fifth of the frames, by what is withheld first: `known`, what is least like the training
+    (`Estimate.known`); `spread`, the widest distributions; `perfect`, the largest errors (unknown in use)."""
 
     def __str__(self) -> str:
         """Describe the gain of withholding a fifth of the frames, in one sentence."""
@@ -185,9 +179,9 @@ class RiskCoverage:
             "spread": "if those with the widest interval are",
             "perfect": "if the largest errors were known",
         }
-        parts = ", ".join(f"{100 * self.error_at(name, 0.8):.1f} {words[name]}" for name in self.error)
-        error = f"{100 * self.error_at('perfect', 1.0):.1f} points"
-        return f"the mean error is {error}; without the fifth of the frames that the network withholds it is {parts}"
+        parts = ", ".join(f"{100 * error:.1f} {words[name]}" for name, error in self.error.items())
+        whole = f"{100 * self.whole:.1f} points"
+        return f"the mean error is {whole}; without the fifth of the frames that the network withholds it is {parts}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -212,7 +206,7 @@ class Evaluation(Result):
     """R2 of the traction ratio F_t / F_n by condition; empty for a network that predicts the margin alone, None
     where the ratio does not vary or no force is known."""
     risk: RiskCoverage | None = None
-    """Error as more and more frames are withheld; None in a result without it."""
+    """Error with a fifth of the frames withheld; None in a result without it."""
 
     @property
     def summary(self) -> str:

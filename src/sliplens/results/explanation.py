@@ -230,10 +230,9 @@ class StripReadings(Columns):
     """Margin of the label."""
     prediction: Annotated[Float64[np.ndarray, " frames"], ANSWER, UNKNOWN]
     """Predicted margin."""
-    low: Annotated[Float64[np.ndarray, " frames"], MARGIN, UNKNOWN]
-    """Lower end of its 90 % interval; NaN for a network that was never calibrated."""
-    high: Annotated[Float64[np.ndarray, " frames"], MARGIN, UNKNOWN]
-    """Upper end of its 90 % interval."""
+    low_90: Annotated[Float64[np.ndarray, " frames"], MARGIN, UNKNOWN]
+    high_90: Annotated[Float64[np.ndarray, " frames"], MARGIN, UNKNOWN]
+    """Ends of its 90 % interval; NaN for a network that was never calibrated."""
     withheld: Shaped[np.ndarray, " frames"]
     """Reason not to trust the predicted margin, with the cure; empty if it can be trusted. Otherwise margin and
     interval are NaN."""

@@ -340,7 +340,7 @@ class StudyConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class Study(Result):
-    """A study, stage by stage; tables are by input, and empty where a stage was not run."""
+    """All that a workspace holds, stage by stage; tables are by input, and empty where a stage was not run."""
 
     folder: Path = Path()
     """Workspace that holds the stages; a temporary one is there as long as the study."""
@@ -354,6 +354,15 @@ class Study(Result):
     faithfulness: dict[str, Faithfulness] = field(default_factory=dict)
     map_quality: dict[str, MapQuality] = field(default_factory=dict)
     truth: dict[str, Truth] = field(default_factory=dict)
+    runs: dict[str, Provenance] = field(default_factory=dict)
+    """By the name of the folder, last finished last."""
+    trainings: dict[str, Training] = field(default_factory=dict)
+    real: dict[str, Explanation] = field(default_factory=dict)
+    """Explanations of frames of a real sensor, where the others are of simulated frames."""
+    strip: Strip | None = None
+    """One trial from stick to slip."""
+    notes: tuple[str, ...] = ()
+    """Sentences on how the results were chosen."""
 
     @property
     def summary(self) -> str:
@@ -416,26 +425,11 @@ _BY_SOURCE = ("explain", "score", "faithfulness")
 """Stages of which a workspace may hold two results of an input: of simulated and of real touch."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Results(Study):
-    """Everything that a workspace holds; a stage that was not run is None or an empty table."""
-
-    runs: dict[str, Provenance] = field(default_factory=dict)
-    """By the name of the folder, last finished last."""
-    trainings: dict[str, Training] = field(default_factory=dict)
-    real: dict[str, Explanation] = field(default_factory=dict)
-    """Explanations of frames of a real sensor, where the others are of simulated frames."""
-    strip: Strip | None = None
-    """One trial from stick to slip."""
-    notes: tuple[str, ...] = ()
-    """Sentences on how the results were chosen."""
-
-
-def load_results(workspace: Path) -> Results:
+def load_results(workspace: Path) -> Study:
     """Load every result in the direct subfolders of a workspace.
 
     A folder counts when it holds `run.json`; its stage, input and source say what it is. Of two results of one kind the
-    one that finished last is loaded, and `Results.notes` says so.
+    one that finished last is loaded, and `Study.notes` says so.
 
     Raises
     ------
@@ -483,7 +477,7 @@ def load_results(workspace: Path) -> Results:
     tables = {table: of(stage, source) for stage, table in TABLES.items()}
     # `sliplens score` writes the deletion score with the removal, a study writes it as a step
     deletion = {name: scores for name, record in tables["faithfulness"].items() if (scores := record.deletion_scores)}
-    return Results(
+    return Study(
         folder=workspace,
         config=load_record(config, StudyConfig, command="sliplens study") if config.exists() else None,
         choice=choice,

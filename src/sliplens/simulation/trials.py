@@ -122,20 +122,17 @@ def simulate(
     require_keywords(simulate, changes)
     recipe = make_recipe(preset, sensor=sensor, **changes)
     with reporting(on_progress), ExitStack() as stack:
-        if out is None:
-            folder = stack.enter_context(scratch_folder())
-            with open_stage("Simulating frames"):
-                data = simulate_dataset(folder, recipe)
-            weakref.finalize(data, stack.pop_all().close)
-            return data
+        target = stack.enter_context(scratch_folder()) / "data" if out is None else Path(out)
         config = {"recipe": recipe.to_json()}
-        with output_folder(Path(out), stage="simulate", config=config, overwrite=overwrite) as output:
+        with output_folder(target, stage="simulate", config=config, overwrite=overwrite) as output:
             if not output.complete:
                 with open_stage("Simulating frames"):
                     simulate_dataset(output.folder, recipe)
-        data = load_dataset(out)
-        size = f"{number_of(len(data.trials), 'trial')}, {number_of(data.frames, 'frame')}"
-        report_file(Path(out), size, kept=output.complete)
+        data = load_dataset(target)
+        if out is not None:
+            size = f"{number_of(len(data.trials), 'trial')}, {number_of(data.frames, 'frame')}"
+            report_file(target, size, kept=output.complete)
+        weakref.finalize(data, stack.pop_all().close)
         return data
 
 

@@ -29,10 +29,10 @@ from sliplens.recordings.options import ReadOptions, option_flags
 from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.recordings.source import SourceOptions, open_source, read_reference
 from sliplens.results.explanation import BASELINES, Explanation, MovedMarkers, Strip, StripReadings, load_explanation
-from sliplens.runner import Part, part
+from sliplens.runner import Part, keep_record, part
 from sliplens.simulation.trials import put_markers_back, rebuild_trial, visible_markers
 from sliplens.study.choice import marker_sums, study_explainers, without_markers
-from sliplens.study.stages import MakeRecord, Stage, keep_record
+from sliplens.study.stages import MakeRecord, Stage
 
 
 class Running(TypedDict, total=False):
@@ -319,8 +319,8 @@ def make_strip(
             withheld=np.array([reason or "" for reason in withheld]),
             safety_margin=margin.astype(np.float64),
             prediction=prediction,
-            low=low,
-            high=high,
+            low_90=low,
+            high_90=high,
         ),
         shown=rows,
         pictures=pictures,

@@ -24,17 +24,18 @@ from sliplens.files import DEFAULT_NETWORK, hash_json, scratch_folder
 from sliplens.intervals import FEWEST_UNITS
 from sliplens.models import Network
 from sliplens.models.wrapping import open_run
-from sliplens.progress import OnProgress, add_note, current_listener, number_of, open_stage, reporting
+from sliplens.progress import OnProgress, add_note, number_of, open_stage, reporting
 from sliplens.recordings import Dataset, load_dataset
+from sliplens.results import study as results
 from sliplens.results.explanation import Explanation, Strip
 from sliplens.results.faithfulness import NEW_WEIGHTS, RemovalCurve
-from sliplens.results.study import CONFIG_FILE, QUICK_METHODS, RECORDS, SETTINGS, TABLES, TESTS, Study, StudyConfig
-from sliplens.runner import MakePart, Work, require_executor
+from sliplens.results.study import Study, StudyConfig
+from sliplens.runner import MakePart, Work, keep_record, require_executor
 from sliplens.simulation.trials import rebuild_trial
 from sliplens.study import choice
 from sliplens.study.explaining import Explaining, make_strip
-from sliplens.study.scoring import STUDY_AREAS, STUDY_ORDERS, Influence, PixelDeletion, Removal, Untrained, measure_maps
-from sliplens.study.stages import Stage, keep_record
+from sliplens.study.scoring import STUDY_ORDERS, Influence, PixelDeletion, Removal, Untrained, measure_maps
+from sliplens.study.stages import Stage
 from sliplens.study.truth import JudgingByTruth, true_curves
 from sliplens.training.evaluation import evaluate
 
@@ -99,8 +100,8 @@ def run_study(
     >>> page = sl.write_report(study)  # doctest: +SKIP
     """
     config = config or StudyConfig()
-    if unknown := sorted(set(config.tests) - set(TESTS)):
-        raise InputError(f"a study has no test named {unknown[0]!r}; choose from {', '.join(TESTS)}")
+    if unknown := sorted(set(config.tests) - set(results.TESTS)):
+        raise InputError(f"a study has no test named {unknown[0]!r}; choose from {', '.join(results.TESTS)}")
     require_executor(on)
     data = data if isinstance(data, Dataset) else load_dataset(data)
     config = _quick(config, data) if config.quick else config
@@ -115,19 +116,15 @@ def run_study(
             on=on,
             overwrite=overwrite,
         )
-        if not (records.folder / CONFIG_FILE).exists():
-            minutes = estimate_minutes(records)
-            add_note(f"this study takes about {max(1, round(minutes))} minutes of one core; --quick takes about five")
-        evaluations = {
-            name: evaluate(
-                run, data, records.folder / f"evaluate-{name}", overwrite=overwrite, on_progress=current_listener()
-            )
-            for name, run in records.networks.items()
-        }
+        if not (records.folder / results.CONFIG_FILE).exists():
+            minutes = max(1, round(estimate_minutes(records)))
+            add_note(f"this study takes about {minutes} minutes of one core; --quick takes about five")
+        for name, run in records.networks.items():
+            evaluate(run, data, records.folder / f"evaluate-{name}", overwrite=overwrite)
         of_networks = [replace(records, network=name) for name in records.networks]
         for step in SHARED:
             _run_step(step, records)
-        write_json(records.folder / CONFIG_FILE, config)
+        write_json(records.folder / results.CONFIG_FILE, config)
         steps = [step for step in _required_steps(config.tests) if step not in SHARED]
         if records.not_redrawn and "truth" in steps:
             steps.remove("truth")
@@ -135,10 +132,8 @@ def run_study(
                 add_note(f"the truth is left out, since {records.not_redrawn}")
         for of_network, step in product(of_networks, steps):
             _run_step(step, of_network)
-        tables = {TABLES[step]: {each.network: each[step] for each in of_networks} for step in steps if step in TABLES}
-        chosen, states, folder = records["choice"], records["states"], records.folder
-        study = Study(folder=folder, config=config, choice=chosen, states=states, evaluations=evaluations, **tables)
-        for sentence in (chosen.summary, *study.left_out.values()):
+        study = results.load_results(records.folder)
+        for sentence in (records["choice"].summary, *study.left_out.values()):
             add_note(sentence)
         weakref.finalize(study, stack.pop_all().close)
         return study
@@ -177,7 +172,7 @@ class Records:
 
     def __getitem__(self, name: str) -> Any:
         """Load the record of a step."""
-        return load_result(self.path(name), RECORDS[name], command="sliplens study")
+        return load_result(self.path(name), results.RECORDS[name], command="sliplens study")
 
     @property
     def run(self) -> Network:
@@ -228,7 +223,7 @@ class Records:
 def _quick(config: StudyConfig, data: Dataset) -> StudyConfig:
     """Shorten a study to the judge that decides; what differs from the defaults stays as it was asked for."""
     default, test = StudyConfig(), "truth" if data.simulated else "faithfulness"
-    short = replace(default, methods=QUICK_METHODS, trials=6, tests=(test,))
+    short = replace(default, methods=results.QUICK_METHODS, trials=6, tests=(test,))
     changed = {name for name, value in vars(config).items() if value != getattr(default, name)}
     return replace(config, **{name: value for name, value in vars(short).items() if name not in changed})
 
@@ -248,25 +243,18 @@ def _require_trials(data: Dataset, config: StudyConfig) -> None:
 
 def estimate_minutes(records: Records) -> float:
     """Estimate the minutes that the steps take on one core, from a few forward passes; half or twice of it is usual."""
-    config, seconds, methods = records.config, 0.0, len(records.config.methods)
+    config, seconds = records.config, 0.0
     infos = choice.sample_trials(records.data, split=config.split, condition=config.condition)
-    trials = min(config.trials, len(infos))
+    frames = min(config.trials, len(infos)) * len(choice.SCORED_LEVELS)
+    # a map takes some 200 passes, with its control 500, and scores as many again; the truth takes 3000
+    passes = (500 if len(config.tests) == 1 else 1000) * len(config.methods) + 3000 * records.data.simulated
     for run in records.networks.values():
         size = run.manifest.image_size
         images = torch.zeros(32, run.encoding.colours, size, size, device=run.device)
         run.predict(images)
         started = time.perf_counter()
         run.predict(images)
-        # passes of a frame by step: a map takes some 200 of them
-        passes = {
-            "explain": 200 * methods * len(choice.LEVELS) / len(choice.SCORED_LEVELS),
-            "control": 100 * methods,
-            "score": (methods + 1) * size,
-            "faithfulness": len(SETTINGS) * (4 * methods + 20) * len(STUDY_AREAS),
-            "truth": 3000 if records.data.simulated else 0,
-        }
-        scored = sum(passes.get(step, 0) for step in _required_steps(config.tests))
-        seconds += trials * len(choice.SCORED_LEVELS) * scored * (time.perf_counter() - started) / len(images)
+        seconds += frames * passes * (time.perf_counter() - started) / len(images)
     return seconds / 60
 
 
@@ -314,7 +302,7 @@ def _remove(records: Records) -> Removal:
         explained=records.explained,
         units=choice.removal_units(records.run, records.explained, records["states"].markers),
         maps=records.influence,
-        settings=SETTINGS[:1] if records.config.quick else SETTINGS,
+        settings=results.SETTINGS[:1] if records.config.quick else results.SETTINGS,
         random_orders=STUDY_ORDERS,
         redraw=None if records.not_redrawn else put_back,
         seed=records.config.seed,
@@ -331,7 +319,7 @@ def judge_by_truth(records: Records) -> JudgingByTruth:
         name: towards * values if name.removesuffix(NEW_WEIGHTS) in raises_only else values
         for name, values in records.influence.items()
     }
-    fills, seed = tuple(dict.fromkeys(setting.fill for setting in SETTINGS)), records.config.seed
+    fills, seed = tuple(dict.fromkeys(setting.fill for setting in results.SETTINGS)), records.config.seed
     return JudgingByTruth(
         trained=records.run, explained=explained, data=records.data, maps=maps, fills=fills, seed=seed
     )

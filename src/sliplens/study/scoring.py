@@ -35,10 +35,10 @@ from sliplens.recordings.source import read_reference
 from sliplens.results.explanation import Explanation, MethodNotes, load_explanation, require_saliency
 from sliplens.results.faithfulness import CHANCE, NEW_WEIGHTS, DeletionScores, Faithfulness, MethodGap, RemovalCurve
 from sliplens.results.study import REDRAWN, SETTINGS, MapMeasures, MapQuality, MarkerTable, Setting, UntrainedMaps
-from sliplens.runner import Part
+from sliplens.runner import Part, keep_record
 from sliplens.study.choice import network_places, trial_seed
 from sliplens.study.explaining import Running
-from sliplens.study.stages import MakeRecord, Stage, TrialArrays, join_trials, keep_record, mean_of_known, trial_parts
+from sliplens.study.stages import MakeRecord, Stage, TrialArrays, join_trials, mean_of_known, trial_parts
 
 STEPS = 28
 """An eighth of the thesis's 224: the mean over the steps differs from that over all of them by less than a step."""

@@ -10,9 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from sliplens.codec import load_result, save_result
-from sliplens.files import output_folder, remove
 from sliplens.models import Network
-from sliplens.progress import report_each, report_file
+from sliplens.progress import report_each
 from sliplens.results.explanation import Explanation
 from sliplens.runner import MakePart, Part, Work, part, run_parts
 
@@ -80,17 +79,6 @@ class TrialArrays:
     """Arrays of the frames of a trial by method, such as maps or predictions."""
 
     arrays: dict[str, Float[np.ndarray, "frames ..."]]
-
-
-def keep_record(
-    folder: Path, make: Callable[[Path], Any], *, stage: str, config: object, what: str, overwrite: bool = False
-) -> None:
-    """Keep a record in a folder, complete or absent; `make` takes the folder of parts that the next call continues."""
-    with output_folder(folder, stage=stage, config=config, overwrite=overwrite) as output:
-        if not output.complete:
-            save_result(make(output.folder / "parts"), output.folder)
-            remove(output.folder / "parts")  # not before: what fails above goes on from them
-    report_file(folder, what, kept=output.complete)
 
 
 def mean_of_known(values: Float[np.ndarray, " values"]) -> float | None:

@@ -1,19 +1,17 @@
 """Evaluation of a network on labelled trials: errors, coverage, warnings."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sliplens.codec import load_result, save_result
+from sliplens.codec import load_result
 from sliplens.errors import RecordingError
-from sliplens.files import output_folder
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.models import Network
 from sliplens.models.wrapping import open_run
-from sliplens.progress import OnProgress, add_note, open_stage, report_file, reporting
+from sliplens.progress import OnProgress, add_note, open_stage, reporting
 from sliplens.recordings import Dataset
 from sliplens.recordings.dataset import load_dataset
 from sliplens.results.evaluation import (
@@ -24,6 +22,7 @@ from sliplens.results.evaluation import (
     RiskCoverage,
     ScoredFrames,
 )
+from sliplens.runner import keep_record
 from sliplens.training.data import FrameSet, load_frames
 
 EACH = "each"
@@ -106,14 +105,9 @@ def evaluate(
             "split": split,
             "friction": prior.digest if isinstance(prior, Friction) else prior,
         }
-        with output_folder(Path(out), stage="evaluate", config=recipe, overwrite=overwrite) as output:
-            if output.complete:
-                evaluation = load_result(output.folder, Evaluation, command="sliplens evaluate")
-            else:
-                evaluation = compute()
-                save_result(evaluation, output.folder)
-        report_file(Path(out), "scores and predictions", kept=output.complete)
-        return evaluation
+        folder, what = Path(out), "scores and predictions"
+        keep_record(folder, lambda _: compute(), stage="evaluate", config=recipe, what=what, overwrite=overwrite)
+    return load_result(folder, Evaluation, command="sliplens evaluate")
 
 
 def evaluate_frames(
@@ -187,13 +181,13 @@ def _r2(truth: Float[np.ndarray, " _"], predicted: Float[np.ndarray, " _"]) -> f
     return float(1 - np.sum((predicted - truth) ** 2) / spread) if spread > 0 else None
 
 
-_COVERED = tuple(round(1 - step / 20, 2) for step in range(20))
+_WITHHELD = 0.2  # share of the frames
 
 
 def risk_coverage(
-    errors: Float[np.ndarray, " frames"], trust: Mapping[str, Float[np.ndarray, " frames"] | None]
+    errors: Float[np.ndarray, " frames"], trust: dict[str, Float[np.ndarray, " frames"] | None]
 ) -> RiskCoverage:
-    """Compute the mean absolute error of the remaining frames, as more and more of the least trusted are withheld.
+    """Compute the mean absolute error without the fifth of the frames that is trusted least.
 
     `trust` is that in each frame, by name; None for a measure that the network lacks. `perfect`, the negative error, is
     always added.
@@ -202,17 +196,15 @@ def risk_coverage(
     ----------
     El-Yaniv and Wiener, *On the Foundations of Noise-free Selective Classification*, JMLR 2010.
     """
-    available = {name: values for name, values in trust.items() if values is not None} | {"perfect": -errors}
-    counts = [max(1, round(share * len(errors))) for share in _COVERED]
-    means = {
-        # stable: frames that are trusted alike are withheld in their order
-        name: np.cumsum(errors[np.argsort(-values, kind="stable")]) / np.arange(1, len(errors) + 1)
-        for name, values in available.items()
+    answered = max(1, round((1 - _WITHHELD) * len(errors)))
+    # stable: frames that are trusted alike are withheld in their order
+    surest = {
+        name: errors[np.argsort(-values, kind="stable")[:answered]]
+        for name, values in (trust | {"perfect": -errors}).items()
+        if values is not None
     }
-    return RiskCoverage(
-        covered=_COVERED,
-        error={name: tuple(mean[np.array(counts) - 1].tolist()) for name, mean in means.items()},
-    )
+    means = {name: float(rest.mean()) for name, rest in surest.items()}
+    return RiskCoverage(whole=float(errors.mean()), error=means)
 
 
 THRESHOLD = 0.2
@@ -254,7 +246,6 @@ def lead_times(predictions: ScoredFrames) -> LeadTimes:
         warned=len(leads),
         median_ms=float(np.median(leads)) if leads else None,
         false_per_minute=false / minutes if minutes > 0 else 0.0,
-        threshold=THRESHOLD,
     )
 
 

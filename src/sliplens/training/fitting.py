@@ -22,12 +22,7 @@ from sliplens.extras import pick, require_keywords
 from sliplens.files import output_folder, scratch_folder, versions
 from sliplens.images import channel_correlations, has_colour
 from sliplens.models import Manifest, Network, build_model, load, save_checkpoint
-from sliplens.models.backbones import (
-    HistogramRegressor,
-    bin_edges,
-    fill_head,
-    last_layer,
-)
+from sliplens.models.backbones import HistogramRegressor, bin_edges, fill_head, last_layer
 from sliplens.models.calibration import Calibration, Traction, calibrate_histogram, conformal_calibration
 from sliplens.models.checkpoint import Estimate, Ratio, sensor_kind
 from sliplens.models.encodings import ENCODINGS, Encoding
@@ -36,7 +31,7 @@ from sliplens.progress import OnProgress, add_note, open_stage, report_each, rep
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.recordings.dataset import load_dataset
 from sliplens.recordings.trial import Recording
-from sliplens.results.evaluation import Training
+from sliplens.results.evaluation import LearningCurve, Training
 from sliplens.shear import FULL_CIRCLE, Shear, ShearEstimator, enclosing_range
 from sliplens.training.config import RECIPES, TrainingChanges, TrainingConfig, make_logger
 from sliplens.training.data import (
@@ -48,13 +43,7 @@ from sliplens.training.data import (
     load_frames,
     require_one_size,
 )
-from sliplens.training.module import (
-    Patience,
-    Regressor,
-    describe_training,
-    make_trainer,
-    run_trainer,
-)
+from sliplens.training.module import Patience, Regressor, make_trainer, run_trainer
 
 _KIND = {
     "all": ("backbone", "head"),
@@ -155,7 +144,7 @@ def train(
     origin = {"input": encoding.name, "condition": condition, "data_hash": data.hash}
     origin |= {} if start is None else {"started_from": start.manifest.weights_sha256}
 
-    def run(folder: Path, opened: Logger | None = None) -> Training:
+    def run(folder: Path, opened: Logger | None) -> Training:
         load_some = partial(load_frames, data, encoding=encoding, image_size=config.image_size, scratch=folder)
         with open_stage(f"Reading training trials ({encoding.name})"):
             train_frames = load_some(trials[0], untouched_share=config.untouched_share)
@@ -181,25 +170,23 @@ def train(
         training = fit(config, train_frames, validation, folder, manifest, start=start, trainer=trainer, logger=opened)
         return replace(training, condition=condition)
 
-    with reporting(on_progress):
+    with reporting(on_progress), scratch_folder() as scratch:
         if start is not None and start.manifest.head == "margin-and-ratio" and config.head == "histogram":
             add_note("the labels have no forces and friction, so the network learns the margin alone: no --friction")
-        if out is None:
-            with scratch_folder() as folder:
-                training = run(folder)
-                return replace(load(folder), training=training)
-        out = Path(out)
-        with output_folder(out, stage="train", config={**origin, "training": config}, overwrite=overwrite) as output:
+        target = scratch / "run" if out is None else Path(out)
+        with output_folder(target, stage="train", config={**origin, "training": config}, overwrite=overwrite) as output:
             if not output.complete:
                 opened = make_logger(logger, output.folder)
                 if opened is not None:
                     opened.log_hyperparams({**asdict(config), **origin})
                 save_result(run(output.folder, opened), output.folder)
-        network = load(out)
+        network = load(target)
         training = network.training
         assert training is not None
         best = f"validation MSE {training.best_validation_mse:.4f}"
-        report_file(out, f"{training.epochs:.1f} epochs in {training.minutes:.1f} min, {best}", kept=output.complete)
+        if out is not None:
+            facts = f"{training.epochs:.1f} epochs in {training.minutes:.1f} min, {best}"
+            report_file(target, facts, kept=output.complete)
         return network
 
 
@@ -404,11 +391,22 @@ def fit(
     )
     save_checkpoint(folder, model, complete)
     late = config.max_minutes is not None and module.step < module.steps
-    training = replace(
-        describe_training(manifest, config, module.rows, frames=(len(train), len(validation)), trained=model),
+    epoch, train_mse, validation_mse, minutes = np.array(module.rows, dtype=np.float64).reshape(-1, 4).T
+    training = Training(
+        input=manifest.input,
+        backbone=manifest.backbone,
+        image_size=manifest.image_size,
+        frame_size=manifest.frame_size,
+        train_frames=len(train),
+        validation_frames=len(validation),
+        seed=config.seed,
+        epochs=float(epoch[-1]),
+        minutes=float(minutes[-1]),
         stopped_by="no gain" if early and early[0].stopped_epoch else "time limit" if late else "epochs",
         # as the file itself has it: after a crash between two files the callback may remember an older one
         best_validation_mse=float(checkpoint["callbacks"][best.state_key]["current_score"]),
+        parameters=sum(values.numel() for values in model.parameters()),
+        curve=LearningCurve(epoch=epoch, train_mse=train_mse, validation_mse=validation_mse, minutes=minutes),
     )
     shutil.rmtree(checkpoints)
     return training

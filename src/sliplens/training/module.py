@@ -25,9 +25,7 @@ from torch.utils.data import DataLoader
 from sliplens.errors import InputError, ModelError
 from sliplens.files import whole_file
 from sliplens.models.backbones import BINS, Answers, bin_centres, last_layer, margin_loss
-from sliplens.models.checkpoint import Manifest
 from sliplens.progress import report_progress
-from sliplens.results.evaluation import LearningCurve, Training
 from sliplens.training.config import TrainingConfig
 from sliplens.training.data import Augmentation
 
@@ -134,10 +132,18 @@ class Regressor(lightning.LightningModule):
         self.log("validation_mse", functional.mse_loss(margins, labels), on_epoch=True, batch_size=len(labels))
 
     def on_train_epoch_end(self) -> None:
-        """Add the epoch's row to the learning curve; the validation has run by now."""
+        """Add the epoch's row to the learning curve and write all of it as CSV; the validation has run by now."""
         metrics, epoch = self.trainer.callback_metrics, self.step / self.steps * self.config.epochs
         errors = [metrics[name].item() for name in ("train_mse", "validation_mse")]
-        add_row(self.rows, [epoch, *errors, self.timer.time_elapsed("train") / 60], self.metrics_file)
+        if not math.isfinite(errors[1]):
+            raise ModelError(
+                f"the validation error is {errors[1]} after epoch {len(self.rows) + 1}; lower the learning rate and "
+                "try again"
+            )
+        self.rows.append([epoch, *errors, self.timer.time_elapsed("train") / 60])
+        with whole_file(self.metrics_file) as part:
+            header, formats = "epoch,train_mse,validation_mse,minutes", ("%.3f", "%.6g", "%.6g", "%.4f")
+            np.savetxt(part, self.rows, fmt=formats, delimiter=",", header=header, comments="")
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """AdamW, without weight decay on biases and normalisation; or Ranger21 with its defaults."""
@@ -147,43 +153,6 @@ class Regressor(lightning.LightningModule):
         others = [value for value in self.parameters() if value.ndim <= 1]
         groups = [{"params": decayed}, {"params": others, "weight_decay": 0.0}]
         return torch.optim.AdamW(groups, lr=self.config.learning_rate, weight_decay=self.config.weight_decay)
-
-
-def add_row(rows: list[list[float]], row: list[float], file: Path) -> None:
-    """Add epoch, training MSE, validation MSE and minutes to a learning curve, and write all of it to a CSV file.
-
-    `ModelError` if the validation error is not finite.
-    """
-    if not math.isfinite(row[2]):
-        raise ModelError(
-            f"the validation error is {row[2]} after epoch {len(rows) + 1}; lower the learning rate and try again"
-        )
-    rows.append(row)
-    with whole_file(file) as part:
-        header, formats = "epoch,train_mse,validation_mse,minutes", ("%.3f", "%.6g", "%.6g", "%.4f")
-        np.savetxt(part, rows, fmt=formats, delimiter=",", header=header, comments="")
-
-
-def describe_training(
-    manifest: Manifest, config: TrainingConfig, rows: list[list[float]], *, frames: tuple[int, int], trained: nn.Module
-) -> Training:
-    """Make the record of a training; `frames`: numbers of training and validation frames, `rows` those of `add_row`."""
-    epoch, train, validation, minutes = np.array(rows, dtype=np.float64).reshape(-1, 4).T
-    return Training(
-        input=manifest.input,
-        backbone=manifest.backbone,
-        image_size=manifest.image_size,
-        frame_size=manifest.frame_size,
-        train_frames=frames[0],
-        validation_frames=frames[1],
-        seed=config.seed,
-        epochs=rows[-1][0],
-        minutes=rows[-1][3],
-        stopped_by="epochs",
-        best_validation_mse=float(validation.min()),
-        parameters=sum(values.numel() for values in trained.parameters()),
-        curve=LearningCurve(epoch=epoch, train_mse=train, validation_mse=validation, minutes=minutes),
-    )
 
 
 class Patience(EarlyStopping):
