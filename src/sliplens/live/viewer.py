@@ -86,8 +86,8 @@ def view(
     Examples
     --------
     >>> import sliplens as sl
-    >>> sl.view("data", out="trial.rrd").frames  # doctest: +SKIP
-    240
+    >>> sl.view("cup.mp4", out="cup.rrd").trial  # doctest: +SKIP
+    'cup'
     """
     require_keywords(view, source_options)
     path = None if out is None else Path(out)

@@ -148,8 +148,8 @@ def label_dataset(
     >>> import sliplens as sl
     >>> from sliplens.recordings import LabelSettings
     >>> data = sl.label_dataset("data", out="other", labelling=LabelSettings(mu=0.8))  # doctest: +SKIP
-    >>> data.read_labels(data.trials[0]).safety_margin[-1].round(2)  # doctest: +SKIP
-    0.36
+    >>> data.read_labels(data.trials[0]).labelling.basis.friction.mu  # doctest: +SKIP
+    0.8
     """
     with reporting(on_progress):
         data = load_dataset(data)
