@@ -26,9 +26,9 @@ def read(one: int, told: dict[str, Any], **more: object) -> int:
 def _read() -> dict[str, object]: ...
 '''
 ALLOWED = {
-    "lines": 35_087,
-    "modules": 144,
-    "riddles_per_1000": 0.23,
+    "lines": 34_259,
+    "modules": 141,
+    "riddles_per_1000": 0.18,
     "vague_docstrings": 0,
     "most_parameters": 12,
     "functions_with_on_progress": 14,

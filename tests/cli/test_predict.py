@@ -52,7 +52,7 @@ def test_a_video_alone_is_read_by_a_network_and_beside_a_frame_that_are_named(
     run(tmp_path / "cup.mkv", "--engine", "torch", "--sensor", tmp_path / "tip.toml")
     known = " ".join(capsys.readouterr().err.split())
     assert "so thesis-raw is used, which the profile tip names" in known
-    assert "reads frames of tip" in known
+    assert "the frames are of tip" in known
     assert "untouched" not in known
 
 
