@@ -160,7 +160,7 @@ def measure(
                 raise SystemExit(f"no browser opened the page within {OPENS_S:g} s; look after Chromium")
             if reading.time_s >= begins_s[0] + seconds:
                 break
-        engine, spent_s = reader._engine.name if reader._engine else "", page_s() - spent_s
+        engine, spent_s = reader.engine.name if reader.engine else "", page_s() - spent_s
     rows = table[: kept[0]]
     rows = rows[rows[:, 0] > 0, 1:]
     if not len(rows):

@@ -17,7 +17,7 @@ from there import there
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import sliplens as sl
-from sliplens.errors import ImageError
+from sliplens.errors import ImageError, InputError
 from sliplens.live.reading import Check, LiveFrame, MarkerReading, Reading, SlipState
 from sliplens.markers import Tracker
 from sliplens.recordings import ContactState, Dataset, Recording
@@ -251,3 +251,16 @@ def test_readers_that_end_in_any_order_give_the_process_its_threads_back(recordi
         assert threads() == {1, 5e-4}
         readers[1].__exit__(None, None, None)
         assert threads() == {2, 5e-3}
+
+
+@pytest.mark.parametrize("unit", ["", "N", "margin"])
+def test_a_module_of_others_is_shown_live_only_if_it_predicts_margins(recording: Recording, unit: str):
+    side = len(recording.reference)
+    module = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(3 * side**2, 1)).eval()
+    network = sl.wrap(module, size=side, unit=unit)
+    source = source_of(recording.frames[:2])
+    if unit == "margin":
+        assert len(source.all_readings(network, reference=recording.reference)) == 2
+    else:
+        with pytest.raises(InputError, match='unit="margin"'):
+            sl.LiveReader(source, network, reference=recording.reference)

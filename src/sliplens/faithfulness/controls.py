@@ -226,7 +226,7 @@ def cascade(model: nn.Module, *, seed: int, stages: int, images: Images) -> Iter
         if hasattr(module, "reset_parameters") and next(module.parameters(recurse=False), None) is not None
     ][::-1]
     if not weighted:
-        raise ModelError("no layer has reset_parameters, by which its weights are drawn anew; add it to your layers")
+        raise ModelError("no layer has reset_parameters, by which its weights are drawn again; add it to your layers")
     ends = {round((stage + 1) * len(weighted) / stages) for stage in range(stages)}
     for count, module in enumerate(weighted, start=1):
         with torch.random.fork_rng(devices=[]):

@@ -196,6 +196,11 @@ class LiveReader:
         if network is None and self._profile is not None:
             network = self._profile.network
         self.network = None if network is None else open_run(network, device=settings.get("device", "cpu"))
+        if self.network is not None and (unit := self.network.manifest.unit) != "margin":
+            raise InputError(
+                f"a running sensor needs safety margins from 0 to 1, and this module predicts {unit or 'numbers'}; if "
+                'these are margins, give sliplens.wrap(module, unit="margin"), else use predict on a recording'
+            )
         options = settings.get("options") or LiveOptions()
         if self.network is not None and self._profile is None:
             options = replace(options, fit_size=self.network.manifest.frame_size)
@@ -224,7 +229,8 @@ class LiveReader:
         self._tracker: Tracker | None = None
         self._smaller, self._dropped, self._colour_doubts = 1, 0, ()
         self._engine_name, self._stall_s = settings.get("engine", "auto"), settings.get("stall_s", 1.0)
-        self._engine: Engine | None = None
+        self.engine: Engine | None = None
+        """Engine of the network, while it is entered."""
         self._forces = None if forces is None else ForceStream(forces)
         self._frames: Mailbox[LiveFrame] = Mailbox()
         self._news, self._stopped, self._over = Condition(), Event(), Event()
@@ -287,7 +293,7 @@ class LiveReader:
                 # before any thread runs: torch's tracing changes what every thread calls
                 frames = min(self.source.count or np.inf, (self.source.rate_hz or 30.0) * (self._seconds or np.inf))
                 frames = round(min(frames, _MOST_FRAMES))
-                self._engine = make_engine(self._engine_name, self.network, frames=frames, batch_size=1, streams=1)
+                self.engine = make_engine(self._engine_name, self.network, frames=frames, batch_size=1, streams=1)
             if untouched is None:
                 self.take_reference()
             else:
@@ -530,7 +536,7 @@ class LiveReader:
     def _predict(self, begin: Reading, frame: LiveFrame) -> Reading:
         """Read a frame that can be compared with the reference."""
         network = self.network
-        if network is None or self._engine is None or self.reference is None:
+        if network is None or self.engine is None or self.reference is None:
             return self._check(begin, frame)
         checked, begun = list[Reading](), time.perf_counter()
         inputs = network.encode(frame.image[None], self.reference)
@@ -540,7 +546,7 @@ class LiveReader:
             yield inputs  # the batch is under way: an engine looks for the next one first
             checked.append(self._check(begin, frame))
 
-        [parts] = self._engine.answers(batches())
+        [parts] = self.engine.answers(batches())
         [reading] = checked
         network_ms = 1e3 * (time.perf_counter() - encoded) - reading.latency.checks_ms
         latency = replace(reading.latency, encode_ms=1e3 * (encoded - begun), network_ms=network_ms)

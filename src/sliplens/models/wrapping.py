@@ -81,7 +81,8 @@ def wrap(
         For a module with several outputs: the place in a tuple or along the columns, such as 0 for the x force of
         (fx, fy, fz), the key in a dict, or a function of what the module returns.
     unit
-        Unit of the output, such as "N", for figures and tables.
+        Unit of the output, such as "N", for figures and tables; "margin" for safety margins in [0, 1], which
+        `read_live` needs.
 
     Raises
     ------
