@@ -1,6 +1,6 @@
 """Commands that make, label and look at data sets, and the first one to try."""
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 from sliplens.cli.app import command
 from sliplens.cli.console import Terminal, print_file, print_table, say
 from sliplens.errors import InputError, RecordingError
-from sliplens.progress import number_of
+from sliplens.progress import fold_equal, number_of
 
 if TYPE_CHECKING:
     from sliplens.recordings import Dataset, TrialInfo
+    from sliplens.recordings.labelling import Labelling
 
 _MOST_ROWS = 24  # number of trials that are listed one by one
 _MOST_NAMES = 6  # number of names in a cell
@@ -69,7 +70,7 @@ def call_import(call: Any, *, audit: bool = True) -> None:
         Draw a page for each trial, in `audit/` of the folder, from which to judge its labels.
     """
     data = call()
-    show_labelled(data, audit=audit)
+    show_labelled("Imported", data, audit=audit)
     if data.left_out:
         print_table("Left out", [{"trial": trial.trial, "why": trial.why} for trial in data.left_out])
         raise SystemExit(1)
@@ -98,24 +99,44 @@ def call_label(call: Any, *, draft: Path | None = None, audit: bool = True) -> N
         draft_corrections(data, draft)
         print_file(draft, f"edit it, then: sliplens label {folder} --corrections {draft}")
         return
-    show_labelled(call(data=data, out=out), audit=audit)
+    show_labelled("Labelled", call(data=data, out=out), audit=audit)
 
 
-def show_labelled(data: "Dataset", *, audit: bool) -> None:
+def show_labelled(title: str, data: "Dataset", *, audit: bool) -> None:
     """Draw the audit pages that are missing, and print what labels rest on and which frames have none."""
-    from sliplens.plots.sheets import describe_labels, write_audits
+    from sliplens.plots.sheets import write_audits
 
     if audit and write_audits(data, data.folder / "audit", on_progress=Terminal()):
         print_file(data.folder / "audit", "a page for each trial: look at them before you train")
-    whole = len(data.trials) <= _MOST_NAMES
-    for info in data.trials[:_MOST_ROWS]:
+    rows, notes, invalid = [], [], Counter[str]()
+    for info in data.trials:
         labels = data.read_labels(info)
-        facts = ["its labels came with it"]
-        if labels.labelling is not None:
-            facts = describe_labels(labels, labels.labelling)
-        say(f"  {info.trial}: {'; '.join(facts if whole else facts[:1])}")
-    if (rest := len(data.trials) - _MOST_ROWS) > 0:
-        say(f"  and {number_of(rest, 'more trial')}; `sliplens check` names those in doubt")
+        counts = Counter(labels.count())
+        valid = counts.pop("valid", 0)
+        rows.append({"trial": info.trial, "valid": f"{valid} of {info.frames}", **_basis(labels.labelling)})
+        notes += labels.labelling.notes if labels.labelling is not None else ()
+        invalid += counts
+    print_table(title, rows[:_MOST_ROWS])
+    if len(rows) > _MOST_ROWS:
+        say(f"  and {number_of(len(rows) - _MOST_ROWS, 'more trial')}; `sliplens check` names those in doubt")
+    for line in fold_equal(dict.fromkeys(notes)):
+        say(f"  note: {line}")
+    reasons = ", ".join(f"{count:,} {reason}" for reason, count in invalid.items())
+    say(f"  frames without a valid label: {reasons or 'none'}")
+
+
+def _basis(labelling: "Labelling | None") -> dict[str, str | None]:
+    """Return the cells of friction, lag and reference."""
+    friction, lag, reference = "came with it", None, "its own"
+    if labelling is not None and (basis := labelling.basis) is not None:
+        mu, low, high = basis.friction.mu, basis.friction.low, basis.friction.high
+        friction = f"{mu:.3f} given" if low == high else f"{mu:.3f} [{low:.3f}, {high:.3f}]"
+        if basis.lag is not None:
+            lag = "unknown" if basis.lag.doubt else f"{1e3 * basis.lag.lag_s:+.1f} +- {1e3 * basis.lag.sigma_s:.1f}"
+            lag += " (applied)" if basis.lag_applied else ""
+    if labelling is not None and labelling.reference.index is not None:
+        reference = f"frame {labelling.reference.index}"
+    return {"mu": friction, "lag, ms": lag, "reference": reference}
 
 
 @command("recover", "recordings.dataset:recover_dataset", "sliplens recover runs/mine/data")
