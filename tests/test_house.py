@@ -26,7 +26,7 @@ def read(one: int, told: dict[str, Any], **more: object) -> int:
 def _read() -> dict[str, object]: ...
 '''
 ALLOWED = {
-    "lines": 34_287,
+    "lines": 34_304,
     "modules": 141,
     "riddles_per_1000": 0.18,
     "vague_docstrings": 0,

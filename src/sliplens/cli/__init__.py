@@ -44,6 +44,8 @@ def call_command(words: list[str]) -> list[str]:
         meant = f"did you mean {' or '.join(near)}? " if near else ""
         raise InputError(f"there is no command {words[0]}; {meant}`sliplens --help` lists all")
     words = words[len(name.split()) :]
+    if "--help" not in words:
+        COMMANDS[name].refuse_early(words)
     function, options = adapt(COMMANDS[name])
     app = cyclopts.App(
         name=f"sliplens {name}",

@@ -8,6 +8,7 @@ from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import cached_property, partial
 from importlib import import_module
 from inspect import Parameter, Signature, signature
+from itertools import pairwise
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, Union, Unpack, get_args, get_origin, get_type_hints
@@ -17,6 +18,7 @@ import docstring_parser
 
 from sliplens.cli.console import Terminal
 from sliplens.errors import InputError
+from sliplens.files import partial_folder, require_new_file
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,8 @@ class Command:
     """Parameters with a further name, such as `("source", "--from")`."""
     writes: str = ""
     """File or folder that must be named, such as `folder of the maps`; empty where the function does without."""
+    suffixes: tuple[str, ...] = ()
+    """Endings of the file `out`; without an ending it is a folder."""
 
     @cached_property
     def definition(self) -> ast.FunctionDef:
@@ -51,6 +55,13 @@ class Command:
         aliases = [alias for name, alias in self.aliases if name == parameter]
         return ["-o", "--output"] if parameter == "out" else aliases
 
+    def refuse_early(self, words: Sequence[str]) -> None:
+        """Refuse a file that cannot be written before the function is imported, which may take seconds."""
+        for option, out in pairwise(words):
+            if option in {"--out", *self.names_of("out")} and self.suffixes and Path(out).suffix:
+                overwrite = "--overwrite" in words or partial_folder(Path(out)).exists()
+                require_new_file(Path(out), suffix=self.suffixes, overwrite=overwrite)
+
 
 COMMANDS: dict[str, Command] = {}
 """Commands by name; `sensor new` and the like have two words."""
@@ -58,12 +69,12 @@ Run = Callable[..., None]
 
 
 def command(
-    name: str, function: str, example: str, *aliases: tuple[str, str], writes: str = ""
+    name: str, function: str, example: str, *aliases: tuple[str, str], writes: str = "", suffixes: tuple[str, ...] = ()
 ) -> Callable[[Run], Run]:
     """Register a function that calls a function of the library, given with its arguments, and prints the result."""
 
     def register(run: Run) -> Run:
-        COMMANDS[name] = Command(f"sliplens.{function}", run, example, aliases, writes)
+        COMMANDS[name] = Command(f"sliplens.{function}", run, example, aliases, writes, suffixes)
         return run
 
     return register

@@ -249,6 +249,7 @@ def _interval(low: float | None, high: float | None) -> str | None:
     "predict",
     "models.predictions:predict",
     "sliplens predict cup.mp4 --sensor tip.toml --plot margin.png -o margins.csv",
+    suffixes=(".parquet", ".csv"),
 )
 def call_predict(call: Any, *, plot: Path | None = None) -> None:
     """Print the margins.
@@ -278,7 +279,9 @@ def call_predict(call: Any, *, plot: Path | None = None) -> None:
         print_file(predictions.path, f"{number_of(predictions.frames, 'frame')}, by {predictions.engine}")
 
 
-@command("export onnx", "models.onnx:export_onnx", "sliplens export onnx runs/mine/train -o tip.onnx")
+@command(
+    "export onnx", "models.onnx:export_onnx", "sliplens export onnx runs/mine/train -o tip.onnx", suffixes=(".onnx",)
+)
 def call_export_onnx(call: Any) -> None:
     """Print what was written."""
     with OUT.status("Exporting; the file appears once ONNX Runtime predicts the same as the network"):

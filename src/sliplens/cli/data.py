@@ -239,6 +239,7 @@ def call_view(call: Any) -> None:
     "markers.tracking:track",
     "sliplens track cup.mp4 --reference untouched.png -o markers.parquet",
     writes="table to write",
+    suffixes=(".parquet",),
 )
 def call_track(call: Any) -> None:
     """Print how many markers were followed."""

@@ -122,7 +122,7 @@ def plate_moved(strip: Strip, moved: MovedMarkers) -> Plate:
         alt=f"A frame with {count} of {moved.markers} markers circled, and the frame drawn again with these moved back",
         caption=f"Moving just these {count} of {moved.markers} markers back to where they stuck changes the prediction "
         f"by {few} points; moving all of them, by {all_}; {count} random ones, by {random} (mean of "
-        f"{moved.random_sets} draws). The simulator drew the second picture anew, and the network predicted it. The "
+        f"{moved.random_sets} draws). The simulator drew the second picture, and the network predicted it. The "
         "circled markers are the fewest that hold half of the evidence in the map of "
         f"{style.method_name(strip.method)}.",
         pixels=True,
