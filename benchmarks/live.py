@@ -1,5 +1,8 @@
 """Latency of live readings: from a frame of 640 x 480 pixels, 60 a second, to its margin, with a page open.
 
+The gel is in the middle of the frame, as in a camera behind a dome; a sensor profile crops and resizes it for the
+network, in the time that is measured.
+
     python benchmarks/live.py --json                # 10 minutes, and one more with maps
     python benchmarks/live.py --minutes 0.5
     python benchmarks/live.py --minutes 0.5 --page none
@@ -44,10 +47,18 @@ from sliplens.app import LivePage
 from sliplens.files import DEFAULT_NETWORK
 from sliplens.live import LiveFrame, LiveSource, Reading, ReplaySource
 from sliplens.models import Network
+from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.source import open_source
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 SIZE = (480, 640)
+GEL_PX, LEFT_PX = 480, 80
+PROFILE = SensorProfile(
+    name="chromatouch",
+    camera_size_px=(640, 480),
+    crop_px=(LEFT_PX, 0, GEL_PX, GEL_PX),
+    resize_px=(224, 224),
+)
 RATE_HZ = 60.0
 WARM_S = 2.0
 """Time at the start, once the page shows its first picture, that counts for nothing: caches fill and clocks rise."""
@@ -72,11 +83,12 @@ def resident_mb() -> float:
 
 
 def make_frames() -> tuple[np.ndarray, np.ndarray]:
-    """A simulated grip at the size of a camera, and the sensor untouched."""
+    """A simulated grip in the middle of a camera's frames, and the sensor untouched."""
     trial = simulate_trial(replace(plan_trials(PRESETS["small"])[0], frames=60))
 
     def enlarge(image: np.ndarray) -> np.ndarray:
-        return np.asarray(Image.fromarray(image).resize((SIZE[1], SIZE[0]), Image.Resampling.BILINEAR))
+        gel = np.asarray(Image.fromarray(image).resize((GEL_PX, GEL_PX), Image.Resampling.BILINEAR))
+        return np.pad(gel, ((0, 0), (LEFT_PX, LEFT_PX), (0, 0)))
 
     return np.stack([enlarge(image) for image in trial.frames]), enlarge(trial.reference)
 
@@ -107,7 +119,6 @@ def measure(
     frames: np.ndarray, untouched: np.ndarray, *, network: Network, seconds: float, shown: bool, maps: bool
 ) -> dict[str, object]:
     """Read a repeated grip for a while, with a page or without, and maps on it or not."""
-    network = replace(network, manifest=replace(network.manifest, frame_size=SIZE))
     source = repeat_frames(frames, seconds=seconds + OPENS_S + 60)
     # made beforehand, so that what is kept here does not look like memory that grows
     table = np.full((round(1.1 * RATE_HZ * seconds) + 600, 2 + len(PARTS)), -1.0)
@@ -138,7 +149,7 @@ def measure(
         if 0 <= since_s < len(memory_mb) and memory_mb[since_s] < 0:
             memory_mb[since_s] = resident_mb()
 
-    reader = sl.LiveReader(source, network, reference=untouched)  # for hours, as far as it knows
+    reader = sl.LiveReader(source, network, reference=untouched, sensor=PROFILE)  # for hours, as far as it knows
     reader.subscribe(keep)
     pictures, explained, spent_s = set[int](), set[int](), 0.0
     with ExitStack() as stack:
@@ -210,9 +221,9 @@ class TurnSource(LiveSource):
 
 
 def load_at(name: str, image_size: int | None = None) -> Network:
-    """A network of the package for frames of this camera, at its own image size or another, at which it errs."""
+    """A network of the package at its own image size or another, at which it errs."""
     network = sl.load(name)
-    manifest = replace(network.manifest, frame_size=SIZE)
+    manifest = network.manifest
     if image_size is not None:
         assert manifest.novelty is not None
         novelty = replace(manifest.novelty, limit=np.inf)  # strange as such pictures are to it, none is withheld
@@ -236,7 +247,7 @@ def measure_in_turn(frames: np.ndarray, untouched: np.ndarray, *, rounds: int) -
         for suffix, options in (("", {}), ("_friction", {"friction": (0.3, 0.9)})):
             ways[name + suffix] = network, options
     readers = {
-        name: sl.LiveReader(TurnSource(), network, reference=untouched, stall_s=3600, **options)
+        name: sl.LiveReader(TurnSource(), network, reference=untouched, sensor=PROFILE, stall_s=3600, **options)
         for name, (network, options) in ways.items()
     }
     names, told = list(readers), {name: SimpleQueue[Reading]() for name in readers}
