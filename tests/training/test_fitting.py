@@ -13,6 +13,7 @@ from sliplens.recordings import Dataset
 from sliplens.results.evaluation import Training
 from sliplens.training import RECIPES, TrainingConfig, evaluate_frames, fit, fitting
 from sliplens.training.data import FrameSet, load_frames
+from sliplens.training.module import WholeCheckpoints
 
 CONFIG = TrainingConfig(image_size=32, epochs=3, batch_size=11, seed=3)
 
@@ -91,6 +92,21 @@ def test_epochs_without_gain_are_not_trained_again(
     first, second = ((tmp_path / name / "model.safetensors").read_bytes() for name in ("whole", "cut"))
     assert first == second
     assert not (tmp_path / "cut" / "checkpoints").exists()
+
+
+def test_a_disk_that_fills_leaves_the_last_checkpoint(tmp_path: Path):
+    resource = pytest.importorskip("resource")
+    path, writer = tmp_path / "last.ckpt", WholeCheckpoints()
+    writer.save_checkpoint({"weights": torch.zeros(8)}, path)
+    before, limits = path.read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2 * len(before), limits[1]))
+    try:
+        with pytest.raises(InputError, match="make room"):
+            writer.save_checkpoint({"weights": torch.zeros(100_000)}, path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_training_leaves_the_callers_random_state_alone(tmp_path: Path, frames: tuple[FrameSet, FrameSet]):

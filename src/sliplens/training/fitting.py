@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -170,10 +171,10 @@ def train(
         training = fit(config, train_frames, validation, folder, manifest, start=start, trainer=trainer, logger=opened)
         return replace(training, condition=condition)
 
-    with reporting(on_progress), scratch_folder() as scratch:
+    with reporting(on_progress), ExitStack() as stack:
         if start is not None and start.manifest.head == "margin-and-ratio" and config.head == "histogram":
             add_note("the labels have no forces and friction, so the network learns the margin alone: no --friction")
-        target = scratch / "run" if out is None else Path(out)
+        target = stack.enter_context(scratch_folder()) / "run" if out is None else Path(out)
         with output_folder(target, stage="train", config={**origin, "training": config}, overwrite=overwrite) as output:
             if not output.complete:
                 opened = make_logger(logger, output.folder)

@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import timedelta
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal
 
@@ -197,8 +198,9 @@ class WholeCheckpoints(TorchCheckpointIO):
     def save_checkpoint(self, checkpoint: dict, path: str | Path, storage_options: object = None) -> None:
         """Write a checkpoint."""
         try:
+            torch.save(checkpoint, content := BytesIO())  # into a file it raises no OSError where the disk is full
             with whole_file(Path(path)) as part:
-                torch.save(checkpoint, part)
+                part.write_bytes(content.getbuffer())
         except OSError as error:
             raise InputError(
                 f"cannot save the checkpoint {path} ({error.strerror}); make room and give the same command again, "
