@@ -15,9 +15,9 @@ from counted_parts import Count, CountInThreads, parts
 from data_sets import contents
 
 from sliplens.errors import InputError, PartError
-from sliplens.files import locked
+from sliplens.files import locked, require_new_table
 from sliplens.progress import reporting
-from sliplens.runner import Part, part, require_new_table, run_parts, run_table
+from sliplens.runner import Part, part, run_parts, run_table
 
 TITLE = "Counting"
 

@@ -211,7 +211,8 @@ def load_record(path: Path, kind: type[Record], *, command: str) -> Record:
     InputError
         If the file is missing, is not JSON, or holds something else than the record declares.
     """
-    return from_builtins(_read_json(path, command), kind, where=path, command=command)
+    values = read_json(path, missing=f"make it with `{command}`", damaged=_cure(command))
+    return from_builtins(values, kind, where=path, command=command)
 
 
 def from_builtins(values: object, kind: type[Record], *, where: Path | str, command: str) -> Record:
@@ -268,20 +269,19 @@ def load_result(folder: Path, kind: type[Record], *, command: str) -> Record:
     InputError
         If a file is missing or damaged, or holds something else than the record declares.
     """
-    path, cure = folder / RESULT_FILE, _cure(command)
-    content = _read_json(path, command)
-    declared, stored = get_type_hints(kind, include_extras=True), {}
+    cure, declared, stored = _cure(command), get_type_hints(kind, include_extras=True), {}
     arrays = {name: hint for name, hint in declared.items() if _is_array(hint)}
     kinds = {name: (get_args(hint) or (hint,))[0] for name, hint in declared.items()}  # of `X` or `X | None`
     tables = {name: each for name, each in kinds.items() if isinstance(each, type) and issubclass(each, Columns)}
     # one dataclass of what is in the JSON, so that msgspec checks it as declared; defaults are kept
     inside = [field for field in fields(kind) if field.name not in {*arrays, *tables}]  # pyright: ignore[reportArgumentType]
-    partial = make_dataclass(kind.__name__, [(field.name, declared[field.name], copy(field)) for field in inside])
-    read = from_builtins(content, partial, where=path, command=command)
+    short = [(field.name, declared[field.name], copy(field)) for field in inside]
+    # None stands in the JSON where there is no table
+    partial = make_dataclass(kind.__name__, [*short, *((name, Any, ...) for name in tables)])
+    read = load_record(folder / RESULT_FILE, partial, command=command)
     values = {field.name: getattr(read, field.name) for field in inside}
     for name, table in tables.items():
-        # None stands in the JSON where there is no table
-        absent = NoneType in get_args(declared[name]) and content.get(name, ...) is None
+        absent = NoneType in get_args(declared[name]) and getattr(read, name) is None
         values[name] = None if absent else _load_columns(folder / f"{name}.parquet", table, cure)
     path = folder / ARRAYS_FILE
     if arrays:
@@ -324,60 +324,53 @@ COLUMN_KINDS: dict[str, Callable[[pa.DataType], bool]] = {
 """Kind of values of a column, from its declaration."""
 
 
-@contextmanager
-def parquet_errors(path: Path, *, cure: str, error: type[InputError] = InputError) -> Iterator[None]:
-    """Convert errors of Arrow on a missing or damaged file, whatever is read of it inside, to one sentence."""
-    try:
-        yield
-    except FileNotFoundError:
-        raise error(f"{path} does not exist; {cure}") from None
-    # names, too, may be no text, and an array of any size may be asked for
-    except (pa.ArrowException, OSError, ValueError, LookupError, MemoryError) as raised:
-        raise error(f"{path} is not a readable Parquet file ({one_line(raised)}); {cure}") from None
-
-
 def open_table(path: Path) -> pq.ParquetFile:
     """Open a Parquet file; `read_table` would import pandas."""
     return pq.ParquetFile(path, memory_map=True)
 
 
+@contextmanager
 def open_parquet(
     path: Path, columns: Mapping[str, str], *, cure: str, error: type[InputError] = InputError
-) -> pq.ParquetFile:
+) -> Iterator[pq.ParquetFile]:
     """Open a Parquet file that must have these columns, each of a kind (`COLUMN_KINDS`), before any row is read.
 
     Raises
     ------
     InputError
-        If the file is missing or no Parquet, lacks a column or holds another kind in it, or expands too far.
+        If the file is missing or no Parquet, lacks a column or holds another kind in it, expands too far, or is damaged
+        where it is read inside.
     """
     size = require_file(path, missing=cure, error=error)
-    with parquet_errors(path, cure=cure, error=error):
-        file = open_table(path)
-        schema, rows = file.schema_arrow, file.metadata.num_rows
-        groups = [file.metadata.row_group(group) for group in range(file.num_row_groups)]
-        chunks = [group.column(at) for group in groups for at in range(group.num_columns)]
-        kinds = {name: [schema.field(at).type for at in schema.get_all_field_indices(name)] for name in columns}
-    for name, kind in columns.items():
-        if len(kinds[name]) != 1:
-            lacks = f"has several columns {name!r}" if kinds[name] else f"lacks the column {name!r}"
-            raise error(f"{path} {lacks}; {cure}")
-        if not COLUMN_KINDS[kind](kinds[name][0]):
-            raise error(f"{path} holds {kinds[name][0]} as {name!r} where {kind} belong; {cure}")
-    expanded = sum(chunk.total_uncompressed_size for chunk in chunks)
-    listed = [chunk for chunk in chunks if columns.get(chunk.path_in_schema) in {"bytes", "values"}]
-    once = [chunk for chunk in listed if "DICT" in str(chunk.encodings)]
-    repeated = max((chunk.total_uncompressed_size * chunk.num_values for chunk in once), default=0)
-    if rows > _MOST_ROWS or expanded > max(MOST_EXPANDED, MOST_TIMES * size) or repeated > _MOST_REPEATED:
-        raise error(f"{path} has {size:,} bytes and claims {rows:,} rows of {expanded:,} bytes; {cure}")
-    return file
+    try:
+        with open_table(path) as file:
+            schema, rows = file.schema_arrow, file.metadata.num_rows
+            groups = [file.metadata.row_group(group) for group in range(file.num_row_groups)]
+            chunks = [group.column(at) for group in groups for at in range(group.num_columns)]
+            for name, kind in columns.items():
+                kinds = [schema.field(at).type for at in schema.get_all_field_indices(name)]
+                if len(kinds) != 1:
+                    lacks = f"has several columns {name!r}" if kinds else f"lacks the column {name!r}"
+                    raise error(f"{path} {lacks}; {cure}")
+                if not COLUMN_KINDS[kind](kinds[0]):
+                    raise error(f"{path} holds {kinds[0]} as {name!r} where {kind} belong; {cure}")
+            expanded = sum(chunk.total_uncompressed_size for chunk in chunks)
+            listed = [chunk for chunk in chunks if columns.get(chunk.path_in_schema) in {"bytes", "values"}]
+            once = [chunk for chunk in listed if "DICT" in str(chunk.encodings)]
+            repeated = max((chunk.total_uncompressed_size * chunk.num_values for chunk in once), default=0)
+            if rows > _MOST_ROWS or expanded > max(MOST_EXPANDED, MOST_TIMES * size) or repeated > _MOST_REPEATED:
+                raise error(f"{path} has {size:,} bytes and claims {rows:,} rows of {expanded:,} bytes; {cure}")
+            yield file
+    # names, too, may be no text, and an array of any size may be asked for
+    except (pa.ArrowException, OSError, ValueError, LookupError, MemoryError) as raised:
+        raise error(f"{path} is not a readable Parquet file ({one_line(raised)}); {cure}") from None
 
 
 def read_parquet(
     path: Path, columns: Mapping[str, str], *, cure: str, error: type[InputError] = InputError
 ) -> pa.Table:
     """Read columns of a Parquet file that `open_parquet` accepts, with no value missing."""
-    with open_parquet(path, columns, cure=cure, error=error) as file, parquet_errors(path, cure=cure, error=error):
+    with open_parquet(path, columns, cure=cure, error=error) as file:
         table = file.read(columns=list(columns))
     if gaps := [name for name in columns if table.column(name).null_count]:
         raise error(f"{path} has gaps in the column {gaps[0]!r}; {cure}")
@@ -511,10 +504,6 @@ def _decode(kind: Any, value: object) -> object:
 
 def _cure(command: str) -> str:
     return f"make it again with `{command}`"
-
-
-def _read_json(path: Path, command: str) -> Any:
-    return read_json(path, missing=f"make it with `{command}`", damaged=_cure(command))
 
 
 def one_line(error: Exception) -> str:

@@ -288,6 +288,19 @@ def locked(target: Path) -> Iterator[None]:
         lock.release()
 
 
+def require_new_table(path: Path, *, suffix: str | Sequence[str], overwrite: bool = False) -> None:
+    """Check that a table can be written under its name.
+
+    Parts that are older than the table are what a process left that was killed after writing it; they are removed.
+    """
+    parts = partial_folder(path)
+    if path.is_file() and (parts.is_dir() or lock_file(path).exists()):
+        with locked(path):
+            if not (parts.is_dir() and parts.stat().st_mtime_ns > path.stat().st_mtime_ns):
+                remove(parts)
+    require_new_file(path, suffix=suffix, overwrite=overwrite)
+
+
 @contextmanager
 def output_folder(
     target: Path, *, stage: str, config: Any, overwrite: bool = False, resumable: bool = True

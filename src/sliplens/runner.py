@@ -36,16 +36,7 @@ from sliplens._version import __version__
 from sliplens.codec import open_table, regrouped, save_result, write_tables
 from sliplens.errors import InputError, PartError, SliplensError
 from sliplens.extras import pick, require_packages
-from sliplens.files import (
-    hash_json,
-    lock_file,
-    locked,
-    output_folder,
-    partial_folder,
-    remove,
-    require_new_file,
-    scratch_folder,
-)
+from sliplens.files import hash_json, locked, output_folder, partial_folder, remove, require_new_file, scratch_folder
 from sliplens.progress import OnProgress, counting, current_reporter, open_stage, report_file
 
 LONGEST = 8192
@@ -440,19 +431,6 @@ def keep_record(
             save_result(make(output.folder / "parts"), output.folder)
             remove(output.folder / "parts")  # not before: what fails above goes on from them
     report_file(folder, what, kept=output.complete)
-
-
-def require_new_table(path: Path, *, suffix: str | Sequence[str], overwrite: bool = False) -> None:
-    """Check that a table can be written under its name.
-
-    Parts that are older than the table are what a process left that was killed after writing it; they are removed.
-    """
-    parts = partial_folder(path)
-    if path.is_file() and (parts.is_dir() or lock_file(path).exists()):
-        with locked(path):
-            if not (parts.is_dir() and parts.stat().st_mtime_ns > path.stat().st_mtime_ns):
-                remove(parts)
-    require_new_file(path, suffix=suffix, overwrite=overwrite)
 
 
 __all__ = ["Part", "Work", "keep_record", "part", "run_parts", "run_table"]

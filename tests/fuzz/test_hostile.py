@@ -12,7 +12,7 @@ from hostile import FORMATS, IMPOSSIBLE, Input, claim_size, inputs, outcome
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sliplens.codec import from_builtins, open_parquet
+from sliplens.codec import from_builtins, read_parquet
 from sliplens.errors import ImageError, InputError, RecordingError, SliplensError
 from sliplens.files import parse_json, require_file
 from sliplens.friction import MOST_FRICTION, Friction
@@ -135,7 +135,7 @@ def test_a_small_table_that_claims_to_be_large_is_not_read(tmp_path: Path):
     once = pa.DictionaryArray.from_arrays(np.zeros(50_000, dtype=np.int32), [b"x" * 100_000])
     pq.write_table(pa.table({"x": once}), tmp_path / "x.parquet", compression="zstd", store_schema=False)
     with pytest.raises(InputError, match=r"claims 50,000 rows"):
-        open_parquet(tmp_path / "x.parquet", {"x": "bytes"}, cure="mend it")
+        read_parquet(tmp_path / "x.parquet", {"x": "bytes"}, cure="mend it")
 
 
 def test_a_gap_among_the_pictures_of_a_trial_is_told(recording: Recording, tmp_path: Path):

@@ -15,10 +15,9 @@ from pathlib import Path
 from changes import count_changes
 
 from sliplens.errors import InputError
-from sliplens.files import locked, output_folder, partial_folder, remove, whole_file, write_json
+from sliplens.files import locked, output_folder, partial_folder, remove, require_new_table, whole_file, write_json
 from sliplens.recordings.dataset import TrialInfo, write_dataset_table
 from sliplens.recordings.splits import split_dataset
-from sliplens.runner import require_new_table
 
 
 def make(folder: Path, text: str = "x") -> None:

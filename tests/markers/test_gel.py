@@ -7,7 +7,7 @@ from dots import draw_dots, make_grid
 from sliplens.errors import ImageError
 from sliplens.markers.gel import propose_profile
 from sliplens.plots.figure import write_proposal
-from sliplens.recordings.sensor import profile_text
+from sliplens.recordings.sensor import save_profile
 
 
 def camera(gel: np.ndarray, *, at: tuple[int, int], size: tuple[int, int] = (240, 320)) -> np.ndarray:
@@ -44,7 +44,8 @@ def test_gel_markers_and_their_kind_are_found(tmp_path, marker, background, kind
     assert min(left - 90, top - 30, 90 + 176 - left - width, 30 + 176 - top - height) >= -2
     assert found.profile.output_size((240, 320)) == (224, 224)
     assert found.spacing_px == pytest.approx(24 * 224 / width, rel=0.01)
-    assert "[" in profile_text(found.profile, notes=found.notes)
+    save_profile(found.profile, tmp_path / "tip.toml", notes=found.notes)
+    assert "[" in (tmp_path / "tip.toml").read_text()
     write_proposal(found, tmp_path / "tip.png")
     assert (tmp_path / "tip.png").stat().st_size > 10_000
 

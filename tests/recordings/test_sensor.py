@@ -11,7 +11,7 @@ from there import there
 
 from sliplens.errors import ImageError, InputError
 from sliplens.recordings.options import LabelSettings
-from sliplens.recordings.sensor import SensorProfile, load_profile, profile_text, shipped_profiles
+from sliplens.recordings.sensor import SensorProfile, load_profile, save_profile, shipped_profiles
 from sliplens.recordings.source import open_source
 
 FRAME = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
@@ -61,7 +61,7 @@ def test_a_profile_comes_back_from_its_text(tmp_path: Path):
         reference_frame=3, frame_rate_hz=30.0, normal_axis="z", normal_sign=-1, network='a "b" ü',
     )  # fmt: skip
     path = tmp_path / "tip.toml"
-    path.write_text(profile_text(profile, notes=("a note",)), encoding="utf-8")
+    save_profile(profile, path, notes=("a note",))
     assert load_profile(path) == profile
     assert load_profile(str(path)) == profile
 

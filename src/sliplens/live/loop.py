@@ -34,8 +34,8 @@ from sliplens.models.engines import Engine, make_engine
 from sliplens.models.predictions import LEVEL
 from sliplens.models.wrapping import open_run
 from sliplens.recordings.capture import Capture, Frame
-from sliplens.recordings.dataset import Dataset, save_profile
-from sliplens.recordings.sensor import SensorProfile, load_profile
+from sliplens.recordings.dataset import Dataset
+from sliplens.recordings.sensor import SENSORS_FOLDER, SensorProfile, load_profile, save_profile
 from sliplens.recordings.source import read_reference
 from sliplens.recordings.trial import ContactState, TrialFacts, contact_states
 from sliplens.shear import ShearEstimator
@@ -420,7 +420,7 @@ class LiveReader:
         self.recorder = recorder
         self.outputs = (recorder, *(output for output in self.outputs if isinstance(output, Sender)))
         if profile is not None:
-            save_profile(Path(folder), profile)
+            save_profile(profile, Path(folder) / SENSORS_FOLDER / f"{profile.name}.toml")
         return recorder
 
     def stop_recording(self) -> Dataset | None:

@@ -12,6 +12,7 @@ from sliplens._version import __version__
 from sliplens.codec import Result, read_written, regrouped, write_tables
 from sliplens.errors import InputError
 from sliplens.extras import import_cv2, pick, require_keywords
+from sliplens.files import require_new_table
 from sliplens.images import Images
 from sliplens.markers.detect import KINDS
 from sliplens.markers.tracker import MarkerStatus, Tracker
@@ -20,7 +21,7 @@ from sliplens.recordings import Dataset
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.sensor import load_profile
 from sliplens.recordings.source import Frame, SourceOptions, Trials, open_trials
-from sliplens.runner import MakePart, Work, require_new_table, run_table
+from sliplens.runner import MakePart, Work, run_table
 
 _ROW_GROUP = 50_000
 _NUMBERS = ("x_px", "y_px", "rest_x_px", "rest_y_px", "dx_px", "dy_px", "radius_px", "deviation_px")

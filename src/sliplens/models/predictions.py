@@ -17,7 +17,7 @@ from sliplens._version import __version__
 from sliplens.codec import TABLE_SUFFIXES, Result, read_written, write_tables
 from sliplens.errors import InputError
 from sliplens.extras import require_keywords
-from sliplens.files import DEFAULT_NETWORK, DIFFERENCE_NETWORK, hash_json
+from sliplens.files import DEFAULT_NETWORK, DIFFERENCE_NETWORK, hash_json, require_new_table
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.images import LEAST_TOUCH, Images, picture_change, soften
 from sliplens.markers.camera import CAMERA_LIMIT_PX, CAMERA_REASON, CameraWatch
@@ -31,7 +31,7 @@ from sliplens.recordings.dataset import DATASET_FILE
 from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.recordings.source import Frame, SourceOptions, Trials, open_trials
 from sliplens.recordings.trial import ContactState
-from sliplens.runner import LONGEST, MakePart, Work, require_new_table, run_table
+from sliplens.runner import LONGEST, MakePart, Work, run_table
 from sliplens.shear import DIRECTION_LIMIT, FULL_CIRCLE, range_words
 
 _REPORT_EVERY = 16

@@ -16,13 +16,13 @@ from matplotlib.patches import Rectangle
 
 from sliplens.codec import COLUMN_KINDS, Columns, Result
 from sliplens.errors import InputError
-from sliplens.files import DEFAULT_NETWORK, require_new_file, whole_file
+from sliplens.files import DEFAULT_NETWORK, require_new_file
 from sliplens.intervals import Difference
 from sliplens.markers.gel import SensorProposal, propose_profile
 from sliplens.plots import charts, style
 from sliplens.plots.saliency import POINTS, SIGN_COLOURS, full_points, overlay_points
 from sliplens.plots.sheets import plot_margin
-from sliplens.recordings.sensor import profile_text
+from sliplens.recordings.sensor import save_profile
 from sliplens.recordings.source import Frames
 from sliplens.results.explanation import CLOSE, Explanation
 from sliplens.results.faithfulness import Faithfulness, is_control
@@ -315,7 +315,6 @@ def make_profile(
     height, width = (0, 0) if keep_size else read_manifest(network).frame_size
     size_px = None if keep_size else (width, height)
     proposal = propose_profile(source, name=name or path.stem, network=None if keep_size else network, size_px=size_px)
-    with whole_file(path) as part:
-        part.write_text(profile_text(proposal.profile, notes=proposal.notes), encoding="utf-8")
+    save_profile(proposal.profile, path, notes=proposal.notes)
     write_proposal(proposal, path.with_suffix(".png"))
     return proposal

@@ -15,22 +15,13 @@ from filelock import FileLock, Timeout
 
 from sliplens.codec import Result, from_builtins, one_line, to_builtins
 from sliplens.errors import InputError, RecordingError, SliplensError
-from sliplens.files import (
-    hash_file,
-    hash_json,
-    parse_json,
-    read_json,
-    require_file,
-    require_folder,
-    whole_file,
-    write_json,
-)
+from sliplens.files import hash_file, hash_json, parse_json, read_json, require_file, require_folder, write_json
 from sliplens.images import encode_png, read_image
 from sliplens.progress import OnProgress, add_note, fold_equal, number_of, report_file, reporting
 from sliplens.recordings import store
 from sliplens.recordings.capture import Capture, Forces, Frame, capture_recording
 from sliplens.recordings.labelling import LabelBasis, Labelling, ReferenceChoice
-from sliplens.recordings.sensor import SENSORS_FOLDER, SensorProfile, load_profile, profile_text
+from sliplens.recordings.sensor import SENSORS_FOLDER, SensorProfile, load_profile
 from sliplens.recordings.store import SCHEMA_VERSION, StoredFacts, forces_path, load_recording, read_header
 from sliplens.recordings.trial import Recording, TrialFacts, labels_of_margins
 
@@ -273,13 +264,6 @@ def report_dataset(data: Dataset, *, existed: bool) -> None:
     report_flags(data)
     count = f"{number_of(len(data.trials), 'trial')}, {number_of(data.frames, 'frame')}"
     report_file(data.folder, count, kept=existed)
-
-
-def save_profile(folder: Path, profile: SensorProfile) -> None:
-    """Write the profile that frames went through into the folder of their data set."""
-    path = folder / SENSORS_FOLDER / f"{profile.name}.toml"
-    with whole_file(path) as part:
-        part.write_text(profile_text(profile), encoding="utf-8")
 
 
 def trial_path(folder: Path, trial: str) -> Path:

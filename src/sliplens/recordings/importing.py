@@ -29,7 +29,7 @@ from sliplens.recordings.labels.margin import label_trial
 from sliplens.recordings.labels.reference import choose_reference
 from sliplens.recordings.manifest import ManifestRow, find_rows
 from sliplens.recordings.options import LabelSettings, ReadOptions
-from sliplens.recordings.sensor import SENSORS_FOLDER, SensorProfile, is_profile, load_profile
+from sliplens.recordings.sensor import SENSORS_FOLDER, SensorProfile, is_profile, load_profile, save_profile
 from sliplens.recordings.source import open_source
 from sliplens.recordings.splits import Group, SplitResult, assign_splits, load_splits, split_by_group
 from sliplens.recordings.store import decode_pixels, encode_pixels, forces_path, in_turn, save_forces, write_trial
@@ -336,7 +336,7 @@ def import_recordings(
                 written = [job for job in jobs.values() if job.capture.trial in names]
                 assigned = _assign(old, [job.capture for job in written], plan, last)
                 for used in {job.profile.name: job.profile for job in written if job.profile}.values():
-                    dataset.save_profile(folder, used)
+                    save_profile(used, folder / SENSORS_FOLDER / f"{used.name}.toml")
                 table = [replace(info, split=split) for info, split in zip([*old, *new], assigned.splits, strict=True)]
                 # trials left out before stay listed
                 missing = {trial.trial: trial for trial in (*left_out, *lost, *failed)}

@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from sliplens.errors import ImageError, InputError
-from sliplens.files import MOST_TEXT, require_file
+from sliplens.files import MOST_TEXT, require_file, whole_file
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.labelling import ReferenceChoice
 from sliplens.recordings.options import LabelSettings
@@ -191,8 +191,10 @@ def is_profile(sensor: Path | str | SensorProfile) -> bool:
     return isinstance(sensor, SensorProfile | Path) or str(sensor) in shipped_profiles() or like_a_file
 
 
-def profile_text(profile: SensorProfile, *, notes: tuple[str, ...] = ()) -> str:
+def save_profile(profile: SensorProfile, path: Path, *, notes: tuple[str, ...] = ()) -> None:
     """Write a profile as TOML, with notes as comments before it."""
     # texts, numbers and lists of numbers are equal in JSON and TOML
     values = {name: json.dumps(value, ensure_ascii=False) for name, value in vars(profile).items() if value is not None}
-    return "\n".join([*(f"# {note}" for note in notes), *(f"{name} = {text}" for name, text in values.items()), ""])
+    lines = [*(f"# {note}" for note in notes), *(f"{name} = {text}" for name, text in values.items()), ""]
+    with whole_file(path) as part:
+        part.write_text("\n".join(lines), encoding="utf-8")

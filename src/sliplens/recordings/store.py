@@ -6,7 +6,6 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
-from functools import partial
 from hashlib import sha256
 from itertools import accumulate, islice, pairwise
 from math import prod
@@ -19,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Float, UInt8
 
-from sliplens.codec import from_builtins, open_parquet, parquet_errors, read_parquet, to_builtins
+from sliplens.codec import from_builtins, open_parquet, read_parquet, to_builtins, write_tables
 from sliplens.errors import RecordingError
 from sliplens.files import hash_json, parse_json, whole_file
 from sliplens.images import MOST_PIXELS, encode_png, read_image
@@ -34,8 +33,6 @@ _Result = TypeVar("_Result")
 SCHEMA_VERSION = 2
 ROW_GROUP = 64  #: Frames that are written and read together.
 _AGAIN = "make the data set again"
-reading = partial(parquet_errors, cure=_AGAIN, error=RecordingError)
-"""Context that turns errors of a missing or damaged file into a `RecordingError` with its cure."""
 
 
 def encode_pixels(pixels: Pixels) -> bytes:
@@ -133,7 +130,7 @@ _KINDS = {
 def _open(path: Path) -> Iterator[tuple[pq.ParquetFile, TrialHeader, Mapping[bytes, bytes]]]:
     """Open a trial, its header and its metadata; whatever is damaged, also of what is read inside, is one sentence."""
     needed = {name: kind for name, kind in _KINDS.items() if name not in OPTIONAL_LABELS}
-    with open_parquet(path, needed, cure=_AGAIN, error=RecordingError) as file, reading(path):
+    with open_parquet(path, needed, cure=_AGAIN, error=RecordingError) as file:
         metadata: Mapping[bytes, bytes] = file.schema_arrow.metadata or {}
         where = f"the header of {path}"
         values = parse_json(metadata[_HEADER], where=where, cure=_AGAIN)
@@ -209,7 +206,7 @@ def load_recording(path: Path, *, truth: bool = True, pixels: bool = True) -> Re
             del kinds["image"]
         size, frames = (header.height, header.width, 3), header.frames
         reference = read_image(metadata[b"reference"], where=f"the reference frame of {path}", cure=_AGAIN)
-        if pixels and frames * prod(size) > _MOST_BYTES:
+        if pixels and frames * prod(size) > 2**35:
             raise RecordingError(f"{path} claims {frames:,} frames, more than memory holds; {_AGAIN}")
         table = read_parquet(path, kinds | (_TRUTH_KINDS if exact else {}), cure=_AGAIN, error=RecordingError)
         labels: dict[str, Any] = {}
@@ -243,9 +240,6 @@ def load_recording(path: Path, *, truth: bool = True, pixels: bool = True) -> Re
             frames=images,
             truth=exact,
         )
-
-
-_MOST_BYTES = 2**35  # of the pixels of a trial that is read at once
 
 
 def stream_frames(path: Path, places: Collection[int] | None = None) -> Iterator[Frame]:
@@ -305,8 +299,7 @@ def save_forces(forces: Forces, path: Path) -> None:
     """Write samples as one Parquet file with a row a sample; complete or not at all."""
     columns = {"time_s": forces.time_s, **dict(zip(_AXES, forces.force_n.T, strict=True))}
     table = pa.table(columns).replace_schema_metadata({"source": forces.source})
-    with whole_file(path) as part:
-        pq.write_table(table, part, compression="zstd")
+    write_tables([table], path, table.schema)
 
 
 def load_forces(path: Path) -> Forces:
