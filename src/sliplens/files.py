@@ -39,13 +39,10 @@ def remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-_PACKAGES = ("numpy", "torch", "torchvision", "lightning", "captum", "matplotlib", "pyarrow", "pillow")
-
-
 def versions() -> dict[str, str]:
     """Read the versions of sliplens, Python and the libraries that shape a result, without importing them."""
     versions_by_name = {"sliplens": __version__, "python": platform.python_version()}
-    for name in _PACKAGES:
+    for name in ("numpy", "torch", "torchvision", "lightning", "captum", "matplotlib", "pyarrow", "pillow"):
         with suppress(metadata.PackageNotFoundError):
             versions_by_name[name] = metadata.version(name)
     return versions_by_name

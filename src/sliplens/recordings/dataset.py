@@ -139,9 +139,6 @@ class Dataset(Result):
         )
 
 
-_RECORDED_SPLIT = "test"  # nothing was trained on it
-
-
 def load_dataset(folder: Dataset | Path | str) -> Dataset:
     """Open a data set that `import_recordings` or `simulate` made; trials are read on request.
 
@@ -241,7 +238,7 @@ def finish_recording(folder: Path, lock: FileLock | None = None) -> None:
         for journal in sorted((folder / JOURNAL_FOLDER).glob("*.arrow")):
             path = trial_path(folder, journal.stem)
             if finish_journal(journal, path):
-                trials[journal.stem] = trial_info(path, split=_RECORDED_SPLIT)
+                trials[journal.stem] = trial_info(path, split="test")  # nothing was trained on it
         write_dataset_table(folder, [*trials.values()], simulated=table.simulated, left_out=table.left_out)
         shutil.rmtree(folder / JOURNAL_FOLDER)
     finally:

@@ -6,12 +6,13 @@ import tempfile
 from abc import abstractmethod
 from array import array
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, Any, TypeAlias, TypedDict, Unpack
 
 import numpy as np
+from jaxtyping import Bool
 from threadpoolctl import threadpool_limits
 
 from sliplens.codec import RESULT_FILE, load_record
@@ -26,7 +27,6 @@ from sliplens.recordings.dataset import Dataset, LeftOut, TrialInfo, load_datase
 from sliplens.recordings.labelling import Corrections, Labelling, Reason, ReferenceChoice
 from sliplens.recordings.labels.lag import describe_repeats, measure_motion
 from sliplens.recordings.labels.margin import label_trial
-from sliplens.recordings.labels.reference import choose_reference
 from sliplens.recordings.manifest import ManifestRow, find_rows
 from sliplens.recordings.options import LabelSettings, ReadOptions
 from sliplens.recordings.sensor import SENSORS_FOLDER, SensorProfile, is_profile, load_profile, save_profile
@@ -213,6 +213,45 @@ class _Footage:
         for place in places:
             where = f"frame {place} of {self.capture.source}"
             yield decode_pixels(self.image(place), size=(*self.capture.frame_size, 3), where=where)
+
+
+_COMPARED = 200  # untouched frames that are compared at most, to bound the memory
+# blocks over which the slow part of an image is taken: wider than a contact's rim, narrower than the light's fall
+_SMOOTH = 9
+
+
+def choose_reference(
+    read: Callable[[Sequence[int]], Iterable[Frame]],
+    untouched: Bool[np.ndarray, " frames"],
+    *,
+    index: int | None = None,
+) -> ReferenceChoice:
+    """Choose the reference among the untouched frames before the contact, or take the one that is named.
+
+    The least energy of contact decides: the mean absolute difference from the median of the untouched frames, after the
+    slow part of the image is subtracted. A contact changes markers and rims, a lamp that warms up changes all of the
+    image alike, and the first frame often holds the hand that started the recording. Only the first stretch of
+    untouched frames counts, of a long one 200 frames, evenly spread.
+
+    `read` reads frames of rising numbers; `index` is the reference by hand, which may touch. Without either, and for a
+    number that is not there, a `RecordingError` is raised.
+    """
+    from scipy.ndimage import uniform_filter  # noqa: PLC0415 (takes as long to import as all else here)
+
+    if index is not None and not 0 <= index < len(untouched):
+        raise RecordingError(f"the reference is frame {index} of {len(untouched)}; name one from 0 on that is there")
+    if index is not None:
+        return ReferenceChoice(index=index, method="named")
+    places = np.flatnonzero(untouched)
+    if not len(places):
+        raise RecordingError("no frame is known to be untouched; name the reference frame by hand")
+    before = places[places - places[:1] == np.arange(len(places))]
+    compared = before[np.linspace(0, len(before) - 1, min(len(before), _COMPARED)).round().astype(int)].tolist()
+    soft = np.stack(list(map(soften, read(compared))))
+    difference = (soft - np.median(soft, axis=0)).astype(np.float64)
+    difference -= uniform_filter(difference, (1, _SMOOTH, _SMOOTH, 1), mode="mirror")
+    energies = [float(np.mean(np.abs(image))) for image in difference]
+    return ReferenceChoice(index=compared[int(np.argmin(energies))], method="least contact energy")
 
 
 class ImportOptions(TypedDict, total=False):

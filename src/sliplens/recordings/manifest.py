@@ -12,12 +12,11 @@ from typing import Any, TypeAlias
 from sliplens.errors import RecordingError
 from sliplens.recordings.formats import recognise
 from sliplens.recordings.formats.arrays import SUFFIXES
-from sliplens.recordings.formats.tables import trial_name
+from sliplens.recordings.formats.tables import TEXT_TABLES, trial_name
 from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.sensor import SensorProfile
 
 _FILES = SUFFIXES | {".mp4", ".m4v", ".mkv", ".mov", ".avi", ".webm", ".mpg", ".mpeg"}
-_TABLES = frozenset({".csv", ".tsv", ".txt"})
 _FORCE_SUFFIX = re.compile(r"[-_. ](forces?|wrench|ft)$", re.IGNORECASE)
 _LONGEST_NAME = 255  # characters, of a file or a folder
 _LONGEST_HEADER = 100_000  # characters
@@ -63,7 +62,7 @@ def pair_recordings(folder: Path) -> tuple[ManifestRow, ...]:
             # some systems write an umlaut as two characters
             recordings[path] = unicodedata.normalize("NFC", path.stem if path.is_file() else path.name)
     for path in paths:
-        if path.is_file() and path.suffix.lower() in _TABLES:
+        if path.is_file() and path.suffix.lower() in TEXT_TABLES:
             stem = unicodedata.normalize("NFC", path.stem)
             # a recording may itself be named lift_ft
             tables.setdefault(stem if stem in recordings.values() else _FORCE_SUFFIX.sub("", stem), []).append(path)

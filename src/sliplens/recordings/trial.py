@@ -43,9 +43,8 @@ def contact_states(margin: Float[np.ndarray, " frames"], *, without: ContactStat
     return tuple(states[kind] for kind in kinds)
 
 
-LABEL_SIGNALS = ("normal_force_n", "tangential_force_n", "friction_coefficient", "safety_margin", "stick_ratio")
-"""The numbers of `Labels`, in the order they are stored."""
-SIGNALS = ("time_s", *LABEL_SIGNALS)  #: The per-frame numbers of a `Recording`, in the order they are stored.
+SIGNALS = ("time_s", "normal_force_n", "tangential_force_n", "friction_coefficient", "safety_margin", "stick_ratio")
+"""The per-frame numbers of a `Recording`, in the order they are stored."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,16 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sliplens.mechanics import (
-    contact_radius,
-    hertz_displacement,
-    indentation,
-    partial_slip_displacement,
-    reduced_modulus,
-    safety_margin,
-    stick_radius,
-    stick_ratio,
-)
+from sliplens import mechanics
 from sliplens.recordings.trial import ContactState, contact_states
 from sliplens.simulation.nuisances import Grasp
 from sliplens.simulation.sensor import Frames, Sensor
@@ -225,11 +216,8 @@ def load_at_margins(margins: Frames, *, grasp: Grasp) -> Loading:
 
     Of the grasp only force and friction count, not drift, creep and the kinetic ratio.
     """
-    return load_at_states(
-        np.where(np.isnan(margins), 0.0, grasp.normal_force_n),
-        friction=np.full(len(margins), grasp.friction),
-        margins=margins,
-    )
+    every = np.ones(len(margins))
+    return load_at_states(grasp.normal_force_n * every, friction=grasp.friction * every, margins=margins)
 
 
 def load_at_states(
@@ -256,7 +244,7 @@ def _label(
     coefficient, carried, slips = friction.coefficient, friction.carried, friction.slips
     tangential = friction.used * coefficient * normal
     # rounding alone would leave a sliding contact a margin of 1e-16
-    margin = np.where(slips & (normal > 0), 0.0, safety_margin(normal, tangential, coefficient))
+    margin = np.where(slips & (normal > 0), 0.0, mechanics.safety_margin(normal, tangential, coefficient))
     rest = coefficient - carried
     on_top = np.clip((friction.used * coefficient - carried) / np.where(rest > 0, rest, 1), 0, 1)
     again = ~np.isnan(margin) & ~slips & (carried > 0)
@@ -271,7 +259,7 @@ def _label(
         friction_coefficient=coefficient,
         static_friction=static,
         safety_margin=margin,
-        stick_ratio=stick_ratio(stick_margin),
+        stick_ratio=mechanics.stick_ratio(stick_margin),
         carried_friction=carried,
         stick_margin=stick_margin,
         let_back=let_back,
@@ -368,8 +356,8 @@ def move_markers(sensor: Sensor, grasp: Grasp, *, loading: Loading, displacement
     creep = 1 + grasp.creep * (1 - np.exp(-loading.held_s / grasp.creep_time_s))
 
     def radius(force_n: np.ndarray, factor: float) -> np.ndarray:
-        modulus = reduced_modulus(youngs_modulus_pa=modulus_pa * factor, poisson_ratio=sensor.poisson_ratio)
-        return np.asarray(contact_radius(force_n, sphere_radius_m=sphere_m, reduced_modulus_pa=modulus))
+        modulus = mechanics.reduced_modulus(youngs_modulus_pa=modulus_pa * factor, poisson_ratio=sensor.poisson_ratio)
+        return np.asarray(mechanics.contact_radius(force_n, sphere_radius_m=sphere_m, reduced_modulus_pa=modulus))
 
     contact_m = radius(loading.normal_force_n * creep, grasp.modulus_factor)
     nominal_m = radius(np.array([Grasp().normal_force_n]), 1.0)
@@ -379,7 +367,7 @@ def move_markers(sensor: Sensor, grasp: Grasp, *, loading: Loading, displacement
     from_centre = rest[:, :2] - centre_m
     distance = np.linalg.norm(from_centre, axis=-1)
     lengths_m = {"contact_radius_m": contact_m[:, None], "sphere_radius_m": sphere_m}
-    outward, inward = hertz_displacement(distance, depth_m, **lengths_m, poisson_ratio=sensor.poisson_ratio)
+    outward, inward = mechanics.hertz_displacement(distance, depth_m, **lengths_m, poisson_ratio=sensor.poisson_ratio)
     yielding = model.layer * clamp
     outward, inward = outward * yielding / np.where(distance > 0, distance, 1), inward * yielding
     pull = np.array([np.cos(grasp.shear_direction_rad), np.sin(grasp.shear_direction_rad)])
@@ -389,7 +377,7 @@ def move_markers(sensor: Sensor, grasp: Grasp, *, loading: Loading, displacement
     moved += inward[..., None] * np.append(np.tan(grasp.tilt_rad), -1)
     for sign, *traction in loading.tractions:
         friction, margin = (values[:, None] for values in traction)
-        along, across, sunk = partial_slip_displacement(
+        along, across, sunk = mechanics.partial_slip_displacement(
             from_centre @ pull,
             from_centre @ athwart,
             depth_m,
@@ -408,9 +396,9 @@ def move_markers(sensor: Sensor, grasp: Grasp, *, loading: Loading, displacement
         scale=geometry.camera_distance(rest) / geometry.camera_distance(moved),
         touch=sunken,
         pressure=np.sqrt(np.maximum(contact_m[:, None] ** 2 - distance**2, 0)) / nominal_m,
-        indentation_m=model.layer * np.asarray(indentation(contact_m, sphere_radius_m=sphere_m)),
+        indentation_m=model.layer * np.asarray(mechanics.indentation(contact_m, sphere_radius_m=sphere_m)),
         nominal_radius_m=float(nominal_m[0]),
         contact_centre_m=centre_m,
         contact_radius_m=contact_m,
-        stick_radius_m=np.asarray(stick_radius(contact_m, np.nan_to_num(loading.stick_margin, nan=0.0))),
+        stick_radius_m=np.asarray(mechanics.stick_radius(contact_m, np.nan_to_num(loading.stick_margin, nan=0.0))),
     )

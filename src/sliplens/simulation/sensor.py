@@ -184,10 +184,6 @@ class FlatPad:
         return _squared_distance(rays, height=height, centre=contact_centre_m)
 
 
-Geometry: TypeAlias = Dome | FlatPad
-"""Shape of a fingertip; another one has the same properties and methods."""
-
-
 Rgb: TypeAlias = tuple[float, float, float]
 _NONE: Rgb = (0.0, 0.0, 0.0)
 _FIELDS = 32
@@ -304,11 +300,11 @@ class Glare:
 class Sensor:
     """A fingertip: its shape and camera, its gel, and how it looks.
 
-    Colours are grey levels (0 to 255) in the order of the image file.
+    Colours are grey levels (0 to 255) in the order of the image file. Another geometry has the members of `Dome`.
     """
 
     name: str
-    geometry: Geometry
+    geometry: Dome | FlatPad
     youngs_modulus_pa: float
     """Young's modulus of the gel."""
     poisson_ratio: float

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sliplens.errors import RecordingError
-from sliplens.recordings.labels.reference import choose_reference
+from sliplens.recordings.importing import choose_reference
 
 SIZE = 84
 

@@ -120,14 +120,7 @@ def find_image(listed: str, where: str, *, folder: Path, root: Path) -> Path:
     raise RecordingError(f"{where}: {listed[:200]!r} is not there, nor under {root}; name its folder with --image-root")
 
 
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except OSError:  # a line that is too long for a name
-        return False
-
-
-_SUFFIXES = frozenset({".csv", ".tsv", ".txt"})
+_is_file = os.path.isfile  # unlike that of a path, False for a line that is too long for a name
 _LEAST_FORCE_N = 1e-9  #: Forces below it are none: the sensor is untouched.
 _LISTS = ("_images_L.txt", "_images_Lref.txt", "_gamma.csv")  # of the thesis: frames, reference frames, margins
 _MARGIN = "safety_margin"
@@ -143,7 +136,7 @@ def find_states(path: Path) -> Path | None:
         return states[0] if len(states) == 1 else None
     for file in files:
         with suppress(RecordingError, OSError, StopIteration):
-            if file.suffix.lower() in _SUFFIXES and file.is_file():
+            if file.suffix.lower() in tables.TEXT_TABLES and file.is_file():
                 table = tables.open_text_table(file)
                 if _MARGIN not in table.header:
                     tables.choose_force_columns(table, ReadOptions())

@@ -23,6 +23,7 @@ from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.trial import MOST_FORCE_N
 
 _SEPARATORS = ("\t", ";", ",", " ")  # a comma may be a decimal one where another separator is there; " " is any space
+TEXT_TABLES = frozenset({".csv", ".tsv", ".txt"})  #: Suffixes of tables in text files.
 _HEAD = 200  # lines, of which most are rows: what comes before the header is text
 _LACKING = ("", "nan", "na", "n/a", "null")  # fields of a sample that dropped out
 _LONGEST_LINE = 100_000  # characters; a file without line breaks would be held whole
