@@ -153,17 +153,10 @@ def write_png(path: Path, pixels: UInt8[np.ndarray, "height width *channels"]) -
     Image.fromarray(pixels).save(path, format="PNG")
 
 
-def encode_png(pixels: UInt8[np.ndarray, "height width *channels"]) -> bytes:
-    """Encode an image as PNG, at the lowest level: noisy frames hardly shrink above it."""
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, format="PNG", compress_level=1)
-    return buffer.getvalue()
-
-
-def encode_jpeg(pixels: UInt8[np.ndarray, "height width 3"], quality: int) -> bytes:
-    """Encode an image as JPEG, for display: it changes pixels."""
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, format="JPEG", quality=quality)
+def encode_image(pixels: UInt8[np.ndarray, "height width *channels"], *, jpeg_quality: int | None = None) -> bytes:
+    """Encode an image as PNG, which hardly shrinks noisy frames above the lowest level, or with loss as JPEG."""
+    form = "PNG" if jpeg_quality is None else "JPEG"
+    Image.fromarray(pixels).save(buffer := io.BytesIO(), format=form, compress_level=1, quality=jpeg_quality)
     return buffer.getvalue()
 
 

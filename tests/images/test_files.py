@@ -8,7 +8,7 @@ from PIL import ExifTags, Image, ImageOps
 from there import there
 
 from sliplens.errors import ImageError, InputError
-from sliplens.images import encode_png, image_size, list_images, read_image, write_png
+from sliplens.images import encode_image, image_size, list_images, read_image, write_png
 from sliplens.recordings.source import open_source
 
 
@@ -25,7 +25,7 @@ def test_lossless_files_give_back_their_pixels(tmp_path: Path, rng: np.random.Ge
 
 def test_png_in_memory_gives_back_its_pixels(rng: np.random.Generator):
     pixels = rng.integers(0, 256, (5, 7, 3), dtype=np.uint8)
-    np.testing.assert_array_equal(read_image(encode_png(pixels), where="a"), pixels)
+    np.testing.assert_array_equal(read_image(encode_image(pixels), where="a"), pixels)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ import pytest
 from scripted import Scripted, frame_of, plain_reader
 
 from sliplens.errors import InputError, SourceError
-from sliplens.images import encode_jpeg
+from sliplens.images import encode_image
 from sliplens.live import CameraSource, LiveOptions, list_cameras, loop, open_live, sources
 from sliplens.live.reading import LiveFrame, Reading
 
@@ -159,7 +159,7 @@ def test_a_stream_leads_to_no_file_of_this_machine(tmp_path: Path):
 class FakeCamera:
     """Camera of 64 x 48 pixels whose packets, in MJPEG, are a film: times in seconds, and bytes."""
 
-    whole = encode_jpeg(np.tile(np.arange(64, dtype=np.uint8)[:, None], (48, 1, 3)), 95)
+    whole = encode_image(np.tile(np.arange(64, dtype=np.uint8)[:, None], (48, 1, 3)), jpeg_quality=95)
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.packets, self.formats, self.fails = [(0.0, self.whole)], {"mjpeg"}, list[OSError | None]()

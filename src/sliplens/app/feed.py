@@ -27,7 +27,7 @@ from sliplens.extras import pick
 from sliplens.files import to_builtins
 from sliplens.grip.controllers import CONTROLLERS
 from sliplens.grip.source import GripSource
-from sliplens.images import encode_jpeg
+from sliplens.images import encode_image
 from sliplens.live.contract import LiveSource
 from sliplens.live.health import CHECKS
 from sliplens.live.loop import LiveReader
@@ -80,7 +80,7 @@ class PageFrame:
         """Frame, smaller where it is large."""
         thumbnail = Image.fromarray(self.frame.image)
         thumbnail.thumbnail((_LONGEST_PX, _LONGEST_PX), reducing_gap=1.0)
-        return encode_jpeg(np.asarray(thumbnail), _QUALITY)
+        return encode_image(np.asarray(thumbnail), jpeg_quality=_QUALITY)
 
     @cached_property
     def arrows(self) -> list[list[float]]:

@@ -18,13 +18,7 @@ from sliplens.live.mailbox import Outlet
 from sliplens.live.reading import LiveFrame
 from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.dataset import Dataset, Journal, JournalHeader, begin_recording, finish_recording, load_dataset
-from sliplens.recordings.formats.tables import (
-    UNITS,
-    guess_force_columns,
-    guess_time_column,
-    require_trial_name,
-    unit_of,
-)
+from sliplens.recordings.formats.tables import UNITS, guess_force_columns, guess_time_column, trial_name, unit_of
 from sliplens.recordings.trial import TrialFacts
 
 _MOST_WAITING_BYTES = 256 * 2**20
@@ -66,7 +60,8 @@ class Recorder(Outlet[tuple[LiveFrame, Frame | None]]):
         simulated: bool = False,
     ) -> None:
         self.folder, self._facts, self._source = Path(folder), facts, source
-        require_trial_name(facts.trial)
+        if (name := facts.trial) != trial_name(name):
+            raise RecordingError(f"trial {name[:40]!r} is no file name; use letters, digits, dots, dashes, underscores")
         lock, taken = begin_recording(self.folder, simulated=simulated)
         self._finish, self._taken = cache(lambda: finish_recording(self.folder, lock)), set(taken)
         self._journal: Journal | None = None

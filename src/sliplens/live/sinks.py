@@ -17,7 +17,7 @@ import numpy as np
 from sliplens.errors import InputError
 from sliplens.extras import Table, require_packages
 from sliplens.files import to_builtins
-from sliplens.images import encode_jpeg, encode_png
+from sliplens.images import encode_image
 from sliplens.live.mailbox import Outlet
 from sliplens.live.reading import LiveFrame, Reading, ReadingWords, describe_reading
 from sliplens.recordings.capture import Frame
@@ -97,7 +97,7 @@ def _open_mcap(address: str) -> Sink:
         at_ns, (seconds, nanoseconds) = _stamp(reading)
         writer.add_message(readings, at_ns, encode_reading(reading), at_ns)
         if image is not None:
-            stamp, data = {"sec": seconds, "nsec": nanoseconds}, encode_jpeg(image, _QUALITY)
+            stamp, data = {"sec": seconds, "nsec": nanoseconds}, encode_image(image, jpeg_quality=_QUALITY)
             picture = {"timestamp": stamp, "frame_id": _FRAME_ID, "format": "jpeg", "data": data}
             writer.add_message(images, at_ns, msgspec.json.encode(picture), at_ns)
 
@@ -162,7 +162,8 @@ class RerunSink:
 
     def log_image(self, entity: str, image: Frame) -> None:
         """Log an image."""
-        data, kind = (encode_png(image), "png") if self._lossless else (encode_jpeg(image, _QUALITY), "jpeg")
+        kind, quality = ("png", None) if self._lossless else ("jpeg", _QUALITY)
+        data = encode_image(image, jpeg_quality=quality)
         self.stream.log(entity, self.rerun.EncodedImage(contents=data, media_type=f"image/{kind}"))
 
     def send(self, reading: Reading, image: Frame | None, /) -> None:
@@ -322,7 +323,7 @@ def _open_zenoh(address: str) -> Sink:
             publish["margin"]([reading.margin], at_ns)
         if image is not None:
             stamp = ros.message("builtin_interfaces/msg/Time", seconds, nanoseconds)
-            data = np.frombuffer(encode_jpeg(image, _QUALITY), dtype=np.uint8)
+            data = np.frombuffer(encode_image(image, jpeg_quality=_QUALITY), dtype=np.uint8)
             publish["image/compressed"]([ros.message("std_msgs/msg/Header", stamp, _FRAME_ID), "jpeg", data], at_ns)
 
     return Sink(send, ros.close)

@@ -16,7 +16,7 @@ from filelock import FileLock, Timeout
 from sliplens.codec import Result, from_builtins, one_line, to_builtins
 from sliplens.errors import InputError, RecordingError, SliplensError
 from sliplens.files import hash_file, hash_json, parse_json, read_json, require_file, require_folder, write_json
-from sliplens.images import encode_png, read_image
+from sliplens.images import encode_image, read_image
 from sliplens.progress import OnProgress, add_note, fold_equal, number_of, report_file, reporting
 from sliplens.recordings import store
 from sliplens.recordings.capture import Capture, Forces, Frame, capture_recording
@@ -309,7 +309,7 @@ class Journal:
     def __init__(self, data: Path, header: JournalHeader, *, reference: Frame | None) -> None:
         metadata = {_HEADER: msgspec.json.encode(to_builtins(header))}
         if reference is not None:
-            metadata[_REFERENCE] = encode_png(reference)
+            metadata[_REFERENCE] = encode_image(reference)
         self.path = data / JOURNAL_FOLDER / f"{header.facts.trial}.arrow"
         self._file = self.path.open("xb")
         self._writer = pa.ipc.new_stream(pa.PythonFile(self._file, mode="w"), _SCHEMA.with_metadata(metadata))

@@ -21,7 +21,7 @@ from jaxtyping import Float, UInt8
 from sliplens.codec import from_builtins, open_parquet, read_parquet, to_builtins, write_tables
 from sliplens.errors import RecordingError
 from sliplens.files import hash_json, parse_json, whole_file
-from sliplens.images import MOST_PIXELS, encode_png, read_image
+from sliplens.images import MOST_PIXELS, encode_image, read_image
 from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.labelling import Labelling
 from sliplens.recordings.trial import OPTIONAL_LABELS, SIGNALS, ContactState, GroundTruth, Labels, Recording, TrialFacts
@@ -183,7 +183,7 @@ def write_trial(
     metadata = {_HEADER: msgspec.json.encode(to_builtins(header))}
     for key, image in ((b"reference", reference), (_FIRST_REFERENCE, first_reference)):
         if image is not None:
-            metadata[key] = encode_png(image)
+            metadata[key] = encode_image(image)
     table = pa.table({"frame": np.arange(len(time_s)), **columns})
     schema = pa.schema([*table.schema, pa.field("image", pa.binary())], metadata)
     images = iter(images)

@@ -345,12 +345,6 @@ def trial_name(text: str) -> str:
     return re.sub(r"[^\w.-]+", "-", unicodedata.normalize("NFC", text)).strip("-.") or "trial"
 
 
-def require_trial_name(trial: str) -> None:
-    """Check that the name of a trial can name a file."""
-    if trial_name(trial) != trial:
-        raise RecordingError(f"trial {trial[:40]!r} cannot name a file; use letters, digits, dots, dashes, underscores")
-
-
 def read_force_table(table: TextTable, options: ReadOptions) -> tuple[Forces, tuple[str, ...]]:
     """Read times and forces from a table with a header, and notes of what was declared or guessed.
 
