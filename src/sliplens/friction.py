@@ -63,10 +63,8 @@ class Friction:
         values = np.atleast_1d(np.asarray(self.values, dtype=np.float64))
         weights = np.ones(len(values)) if self.weights is None else np.asarray(self.weights, dtype=np.float64)
         if not np.all(possible := (values > 0) & (values <= MOST_FRICTION)):
-            raise InputError(
-                f"a coefficient of friction is a positive number up to {MOST_FRICTION:g}, got "
-                f"{values[~possible][0]:g}; give F_t / F_n at which the object slips, such as 0.6"
-            )
+            wrong = f"a coefficient of friction is positive, up to {MOST_FRICTION:g}, got {values[~possible][0]:g}"
+            raise InputError(f"{wrong}; give F_t / F_n at which the object slips, such as 0.6")
         if weights.shape != values.shape or not (np.all(weights >= 0) and 0 < weights.sum() < math.inf):
             raise InputError(f"{len(values)} values of friction need as many weights, none negative and not all zero")
         object.__setattr__(self, "values", values)
@@ -76,10 +74,8 @@ class Friction:
     def between(cls, low: float, high: float, *, values: int = 41) -> "Friction":
         """Friction evenly distributed in a range, at the middles of equal shares of it."""
         if not 0 < low < high <= MOST_FRICTION:
-            raise InputError(
-                f"a range of friction runs from a positive low to a larger high, at most {MOST_FRICTION:g}, got "
-                f"{low:g}..{high:g}; give the smaller number first, such as 0.5..0.8"
-            )
+            wrong = f"a range of friction rises, from above 0 to at most {MOST_FRICTION:g}, got {low:g}..{high:g}"
+            raise InputError(f"{wrong}; give the smaller number first, such as 0.5..0.8")
         middles = low + (high - low) * (np.arange(values) + 0.5) / values
         return cls(middles, note=f"{low:g} to {high:g}, range")
 
@@ -87,10 +83,8 @@ class Friction:
     def about(cls, mean: float, sigma: float) -> "Friction":
         """Friction with a mean and a standard deviation, normal in the logarithm and so never negative."""
         if not (0 < mean <= MOST_FRICTION and 0 < sigma < mean):
-            raise InputError(
-                "mean and standard deviation of friction are positive, the mean the larger and at most "
-                f"{MOST_FRICTION:g}, got {mean:g}+-{sigma:g}; give such as 0.58+-0.05, or the mean alone"
-            )
+            wrong = f"mean and spread of friction are positive, the mean is larger, got {mean:g}+-{sigma:g}"
+            raise InputError(f"{wrong}; give such as 0.58+-0.05, the mean up to {MOST_FRICTION:g} or alone")
         spread = math.sqrt(math.log1p((sigma / mean) ** 2))
         steps = np.linspace(-_REACH, _REACH, 81)
         nodes = mean * np.exp(spread * steps - spread**2 / 2)
@@ -123,9 +117,7 @@ class Friction:
         Exact friction stays; a slip far outside the possible values leaves the nearest of them.
         """
         if not (0 < ratio < math.inf and 0 < sigma < math.inf):
-            raise InputError(
-                f"a slip needs a positive ratio F_t / F_n and a positive sigma, got {ratio:g} and {sigma:g}"
-            )
+            raise InputError(f"F_t / F_n at a slip and its sigma are positive; correct {ratio:g} +- {sigma:g}")
         values, weights = self.nodes
         with np.errstate(divide="ignore"):
             posterior = np.log(weights) - 0.5 * ((values - ratio) / sigma) ** 2

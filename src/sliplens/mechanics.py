@@ -10,8 +10,7 @@ are relative to the contact's centre. The fields are closed forms, right to 1e-1
 distance, and 0 where nothing touches (a = 0). Numbers and arrays broadcast: frames can run down and markers across.
 """
 
-from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
@@ -156,10 +155,8 @@ def safety_margin(normal_force_n: Numbers, tangential_force_n: Numbers, friction
     normal = np.asarray(_require_not_negative(normal_force_n, name="normal force", unit="N"))
     tangential = _require_not_negative(tangential_force_n, name="tangential force", unit="N")
     if not np.all(np.asarray(friction_coefficient) > 0):
-        raise ContactError(
-            f"the coefficient of friction must be positive, got {np.min(friction_coefficient):.3g}; "
-            "measure it at the onset of slip"
-        )
+        wrong = f"the coefficient of friction must be positive, got {np.min(friction_coefficient):.3g}"
+        raise ContactError(f"{wrong}; measure it at the onset of slip")
     capacity = normal * friction_coefficient
     pressing = capacity > 0
     used = tangential / np.where(pressing, capacity, 1)
@@ -195,10 +192,8 @@ def stick_ratio(safety_margin: Numbers, *, profile_exponent: float = 2.0) -> Arr
     _require_positive(profile_exponent, name="profile exponent", unit="(no unit)")
     margin = np.asarray(safety_margin, dtype=np.float64)
     if np.any((margin < 0) | (margin > 1)):
-        raise ContactError(
-            f"safety margins must lie in [0, 1], got {np.nanmin(margin):.3g} to {np.nanmax(margin):.3g}; "
-            "give them as fractions, not in percent"
-        )
+        span = f"{np.nanmin(margin):.3g} to {np.nanmax(margin):.3g}"
+        raise ContactError(f"safety margins must lie in [0, 1], got {span}; give them as fractions, not in percent")
     return np.asarray(margin ** (2 / (profile_exponent + 1)))
 
 
@@ -356,8 +351,7 @@ def partial_slip_displacement(
     return np.asarray(whole[0] - stuck[0]), np.asarray(whole[1] - stuck[1]), np.asarray(whole[2] - stuck[2])
 
 
-@dataclass(frozen=True, kw_only=True)
-class _DiscSums:
+class _DiscSums(NamedTuple):
     """N of `_sum_over_disc` and derivatives of N, L and K, times factors that keep them finite on axis and surface."""
 
     newton: Numbers  # N

@@ -187,9 +187,7 @@ def label_dataset(
             add_note(f"corrections of {number_of(len(corrections), 'trial')} applied")
         if removed := sorted(before.keys() - corrections.keys()):
             add_note(f"corrections of {number_of(len(removed), 'trial')} removed, such as {removed[0]}")
-        labelled = load_dataset(out)
-        dataset.report_dataset(labelled, existed=output.complete)
-    return labelled
+        return dataset.report_dataset(out, existed=output.complete)
 
 
 @dataclass(frozen=True, kw_only=True)

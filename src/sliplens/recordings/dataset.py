@@ -256,11 +256,12 @@ def report_flags(data: Dataset) -> None:
         add_note(message)
 
 
-def report_dataset(data: Dataset, *, existed: bool) -> None:
-    """Report a data set that was written, or was there already, and the flags on its labels."""
-    report_flags(data)
+def report_dataset(folder: Dataset | Path, *, existed: bool) -> Dataset:
+    """Open a data set that was written, or was there already, and report it and the flags on its labels."""
+    report_flags(data := load_dataset(folder))
     count = f"{number_of(len(data.trials), 'trial')}, {number_of(data.frames, 'frame')}"
     report_file(data.folder, count, kept=existed)
+    return data
 
 
 def trial_path(folder: Path, trial: str) -> Path:

@@ -385,9 +385,7 @@ def import_recordings(
                 remove(folder / PARTS)
         for message in assigned.notes:
             add_note(message)
-        data = load_dataset(out)
-        dataset.report_dataset(data, existed=output.complete)
-        return data
+        return dataset.report_dataset(Path(out), existed=output.complete)
 
 
 def _prepare_work(

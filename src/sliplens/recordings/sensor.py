@@ -161,22 +161,20 @@ def load_profile(profile: Path | str | SensorProfile) -> SensorProfile:
     """
     if isinstance(profile, SensorProfile):
         return profile
-    path = Path(profile)
-    if not path.exists() and str(profile) in shipped_profiles():
+    path, names = Path(profile), shipped_profiles()
+    if not path.exists() and str(profile) in names:
         path = _SHIPPED / f"{profile}.toml"
     if not path.is_file():
-        raise InputError(
-            f"there is no sensor profile {profile}; name a file, or one of {', '.join(shipped_profiles())}"
-        )
+        raise InputError(f"there is no sensor profile {profile}; name a file, or one of {', '.join(names)}")
     require_file(path, most=MOST_TEXT)
     try:
         # Windows editors put a mark before the text that TOML does not know
         values = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is not valid TOML: {error}; correct it there") from None
-    names = [field.name for field in fields(SensorProfile)]
-    if strange := sorted(set(values) - set(names)):
-        raise InputError(f"{path} has {strange[0]!r}, which no sensor profile has; choose from {', '.join(names)}")
+    keys = [field.name for field in fields(SensorProfile)]
+    if strange := sorted(set(values) - set(keys)):
+        raise InputError(f"{path} has {strange[0]!r}, which no sensor profile has; choose from {', '.join(keys)}")
     try:
         return msgspec.convert(values, SensorProfile)
     except (msgspec.ValidationError, ValueError) as error:

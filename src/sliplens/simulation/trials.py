@@ -168,19 +168,15 @@ def rebuild_trial(folder: Path, recording: Recording) -> Film:
     recipe = read_recipe(folder)
     plans = {plan.trial: plan for plan in plan_trials(recipe)}
     if recipe.hash != truth.recipe or name not in plans:
-        raise InputError(
-            f"trial {name} of {folder} was simulated by another recipe, or by another version of sliplens than this "
-            f"{__version__}; simulate the data set again"
-        )
+        made = f"was simulated by another recipe, or by another version of sliplens than this {__version__}"
+        raise InputError(f"trial {name} of {folder} {made}; simulate the data set again")
     _, film = prepare_trial(plans[name])
     # the untouched sensor shows light, camera and print; the last frame depends on all the rest
     last = len(film) - 1
     drawn = torch.stack([film.draw_reference(), film.draw(slice(last, last + 1))[0]]).numpy().astype(np.int16)
     if np.abs(drawn - [recording.reference, recording.frames[last]]).max() > _ROUNDING:
-        raise InputError(
-            f"trial {name} of {folder} is drawn differently from its stored frames: they were changed, or other "
-            "versions of numpy and torch made them; simulate the data set again"
-        )
+        cause = "they were changed, or other versions of numpy and torch made them"
+        raise InputError(f"trial {name} of {folder} is not drawn as it is stored: {cause}; simulate the data set again")
     return film
 
 
