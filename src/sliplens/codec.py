@@ -52,8 +52,8 @@ class _Described:
         for field in fields(self):  # pyright: ignore[reportArgumentType]
             value = getattr(self, field.name)
             if field.name != "summary" and (text := _words(value, _unit(type(self), field.name))):
-                label = _UNIT_ENDING.sub("", field.name).replace("_", " ")
-                lines = short if isinstance(value, _SCALARS) else long
+                label = re.sub("_(n|px|s|ms|hz|m|deg)$", "", field.name).replace("_", " ")
+                lines = short if isinstance(value, str | int | float | Path) else long
                 lines.append(shorten(f"{label}: {text}", 110, placeholder=" ..."))
         lines = [*wrap(", ".join(short), 110, max_lines=3), *long]
         if (over := len(lines) - _MOST_LINES + 2) > 1:
@@ -106,12 +106,10 @@ class Result(_Described):
 
 
 _MOST_LINES = 10
-_SCALARS = (str, int, float, Path)
 _UNITS = {
     "n": "N", "px": "px", "s": "s", "ms": "ms", "hz": "Hz", "m": "m", "deg": "degrees", "minutes": "min",
     "seconds": "s", "mse": "(margin units squared)", "mae": "margin units",
 }  # fmt: skip
-_UNIT_ENDING = re.compile("_(n|px|s|ms|hz|m|deg)$")
 
 
 def _unit(kind: type, name: str) -> str:

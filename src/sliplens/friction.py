@@ -21,7 +21,6 @@ LEARNT = "learnt from slips"
 _LOWEST, _HIGHEST = 0.05, 2.0  # unknown friction: ice on steel to clean rubber on glass
 _REACH = 4.0  # standard deviations to either side that a distribution of friction covers
 _NODES = 400  # values over two decades, in steps of 1 %: finer than any slip shows
-_NEGLIGIBLE = 1e-6
 _MOST_RATIOS, _FRESH_S = 120, 0.3  # ratios in memory; largest age of a ratio at a slip: an older one is too small
 
 
@@ -264,7 +263,7 @@ def as_friction(friction: FrictionLike) -> Friction:
 def _likely(values: Float[np.ndarray, " values"], weights: Float[np.ndarray, " values"], *, note: str) -> Friction:
     """Return friction without values that are a million times less likely than the likeliest."""
     weights = weights / weights.sum()
-    likely = weights > _NEGLIGIBLE * weights.max()
+    likely = weights > 1e-6 * weights.max()
     return Friction(values[likely], weights[likely], note=note)
 
 

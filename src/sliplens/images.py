@@ -24,21 +24,18 @@ Images: TypeAlias = Any  #: Images that `as_frames` takes: an array, a PyTorch t
 
 IMAGE_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp"})
 
-_BITS_PER_SAMPLE = 258  # TIFF tag
 _REDUCE = "divide its levels by 256, or by 16 or 4 where the camera gives 12 or 10 bits"
 _TAGGED = frozenset({"exif", "Raw profile type exif", "XML:com.adobe.xmp", "xmp"})
 """Entries of a header in which Pillow finds the tag; without any it would decode a PNG to search behind its pixels."""
+_DAMAGE = (OSError, SyntaxError, ValueError, MemoryError, Image.DecompressionBombError)  # what Pillow raises
 MOST_PIXELS = 100_000_000
 """Largest number of pixels: more mean a damaged header, and would need gigabytes."""
-_DAMAGE = (OSError, SyntaxError, ValueError, MemoryError, Image.DecompressionBombError)  # what Pillow raises
-_LEAST_COLOUR = 16
-"""Grey levels by which channels of a colour differ: more than by a camera's noise on grey objects."""
 
 
 def has_colour(image: UInt8[np.ndarray, "height width 3"]) -> bool:
     """Check whether at least a hundredth of an image has a colour; the channels of a grey camera are equal."""
     spread = image.max(axis=-1) - image.min(axis=-1)
-    return bool(np.mean(spread >= _LEAST_COLOUR) >= 0.01)
+    return bool(np.mean(spread >= 16) >= 0.01)  # grey levels, more than a camera's noise on grey objects
 
 
 def channel_correlations(image: UInt8[np.ndarray, "height width 3"]) -> tuple[float, float]:
@@ -51,7 +48,7 @@ def channel_correlations(image: UInt8[np.ndarray, "height width 3"]) -> tuple[fl
 
 def _require_plain(image: Image.Image, where: str) -> None:
     """Refuse an image that is not one of 8 bits a channel: of 16, Pillow keeps the upper 8, and of 12 these are 4."""
-    bits = max(getattr(image, "tag_v2", {}).get(_BITS_PER_SAMPLE, (8,)))
+    bits = max(getattr(image, "tag_v2", {}).get(ExifTags.Base.BitsPerSample, (8,)))
     if image.mode.startswith("I;16") or any(";16" in str(tile.args) for tile in getattr(image, "tile", ())):
         bits = 16
     if bits > 8:

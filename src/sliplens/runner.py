@@ -42,7 +42,6 @@ from sliplens.progress import OnProgress, counting, current_reporter, open_stage
 LONGEST = 8192
 """Largest number of frames of a part; a longer trial is divided."""
 _LONGEST_NAME = 200  # of a folder; file systems take 255 bytes
-_FATAL = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}  # no other part could be written either
 
 MakePart: TypeAlias = Callable[[Any, Path], None]
 """Takes the item of a part and the path to write; reports its frames by `progress.report_progress`."""
@@ -192,8 +191,8 @@ def _run(
                 continue
             if isinstance(error, _PreparationError):
                 raise error.args[0]
-            if isinstance(error, OSError) and error.errno in _FATAL:
-                raise error
+            if isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT, errno.EROFS}:
+                raise error  # no other part could be written either
             errors[each.name] = error
             count(each, 0, 1)
     return errors

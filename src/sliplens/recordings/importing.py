@@ -153,6 +153,7 @@ def import_trial(job: TrialJob, path: Path) -> None:
             raise RecordingError(f"{capture.source}: {error}{job.cure}") from None
         # for who takes the correction back
         replaced = capture.reference is not None and corrections is not None and corrections.reference_frame is not None
+        first = capture.reference_choice or ReferenceChoice(method="came with the recording")
         labelling = labels.labelling or Labelling(
             source=capture.source,
             forces=capture.forces.source if capture.forces else None,
@@ -160,9 +161,7 @@ def import_trial(job: TrialJob, path: Path) -> None:
             reference=choice,
             basis=basis,
             corrections=corrections,
-            first_reference=(capture.reference_choice or ReferenceChoice(method="came with the recording"))
-            if replaced
-            else None,
+            first_reference=first if replaced else None,
         )
         # before the trial, whose file means that all of it is there
         if capture.forces is not None:
@@ -215,11 +214,6 @@ class _Footage:
             yield decode_pixels(self.image(place), size=(*self.capture.frame_size, 3), where=where)
 
 
-_COMPARED = 200  # untouched frames that are compared at most, to bound the memory
-# blocks over which the slow part of an image is taken: wider than a contact's rim, narrower than the light's fall
-_SMOOTH = 9
-
-
 def choose_reference(
     read: Callable[[Sequence[int]], Iterable[Frame]],
     untouched: Bool[np.ndarray, " frames"],
@@ -246,10 +240,12 @@ def choose_reference(
     if not len(places):
         raise RecordingError("no frame is known to be untouched; name the reference frame by hand")
     before = places[places - places[:1] == np.arange(len(places))]
-    compared = before[np.linspace(0, len(before) - 1, min(len(before), _COMPARED)).round().astype(int)].tolist()
+    # no more at a time, to bound the memory
+    compared = before[np.linspace(0, len(before) - 1, min(len(before), 200)).round().astype(int)].tolist()
     soft = np.stack(list(map(soften, read(compared))))
     difference = (soft - np.median(soft, axis=0)).astype(np.float64)
-    difference -= uniform_filter(difference, (1, _SMOOTH, _SMOOTH, 1), mode="mirror")
+    # the slow part of an image is a mean over 9 blocks: wider than a contact's rim, narrower than the light's fall
+    difference -= uniform_filter(difference, 9, mode="mirror", axes=(1, 2))
     energies = [float(np.mean(np.abs(image))) for image in difference]
     return ReferenceChoice(index=compared[int(np.argmin(energies))], method="least contact energy")
 

@@ -19,8 +19,6 @@ from sliplens.recordings.trial import TrialFacts
 
 SPLITS = ("train", "validation", "test")  #: Splits that trials are assigned to.
 Group: TypeAlias = Literal["trial", "object", "day"]  #: Facts by which trials are grouped.
-# shares are written with few digits: thirds as 0.3333 should be corrected by whoever wrote them
-_SUM_TOLERANCE = 1e-6
 _MOST_NAMES = 5  # names in a message before the rest is counted
 
 
@@ -87,7 +85,8 @@ def split_by_group(
     names = [trial.trial for trial in trials]
     if by not in get_args(Group):
         raise InputError(f"trials cannot be split by {by!r}; choose {', '.join(get_args(Group))}")
-    if any(not (math.isfinite(share) and share >= 0) for share in shares) or abs(sum(shares) - 1) > _SUM_TOLERANCE:
+    # thirds as 0.3333 should be corrected by whoever wrote them
+    if any(not (math.isfinite(share) and share >= 0) for share in shares) or abs(sum(shares) - 1) > 1e-6:
         raise InputError(f"the shares are {', '.join(map(str, shares))}; give three, none below 0, that sum to 1")
     group_of = [str(getattr(trial, by)) for trial in trials]
     unknown = sorted(name for name, group in zip(names, group_of, strict=True) if not group)

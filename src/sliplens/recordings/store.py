@@ -181,9 +181,8 @@ def write_trial(
     stored = {name: getattr(facts, name) for name in _FACTS} | {"frames": len(time_s), "height": height, "width": width}
     header = TrialHeader(**stored, labelling=labels.labelling, truth=truth_header)
     metadata = {_HEADER: msgspec.json.encode(to_builtins(header))}
-    for key, image in ((b"reference", reference), (_FIRST_REFERENCE, first_reference)):
-        if image is not None:
-            metadata[key] = encode_image(image)
+    pictures = {b"reference": reference, _FIRST_REFERENCE: first_reference}
+    metadata |= {key: encode_image(image) for key, image in pictures.items() if image is not None}
     table = pa.table({"frame": np.arange(len(time_s)), **columns})
     schema = pa.schema([*table.schema, pa.field("image", pa.binary())], metadata)
     images = iter(images)

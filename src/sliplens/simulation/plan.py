@@ -243,7 +243,6 @@ def plan_trials(recipe: SimulationRecipe) -> tuple[TrialPlan, ...]:
     # without days between, the first day gives up some of its trials
     candidates = between or [(1, number) for number in range(1, dry[1] + 1)]
     count = max(1, round(recipe.validation_share * len(candidates))) if candidates else 0
-    # evenly spaced over the days
     validation = {candidates[int((index + 0.5) * len(candidates) / count)] for index in range(count)}
 
     plans = []

@@ -157,9 +157,6 @@ def visible_markers(sensor: Sensor) -> Int[np.ndarray, " markers"]:
     return np.flatnonzero(np.all((points >= border) & (points <= sensor.image_size_px - 1 - border), axis=-1))
 
 
-_ROUNDING = 1  # grey levels by which another device or library may draw the same scene differently
-
-
 def rebuild_trial(folder: Path, recording: Recording) -> Film:
     """Prepare a trial of a simulated data set to be drawn again with the same bytes."""
     name, truth = recording.trial, recording.truth
@@ -174,7 +171,8 @@ def rebuild_trial(folder: Path, recording: Recording) -> Film:
     # the untouched sensor shows light, camera and print; the last frame depends on all the rest
     last = len(film) - 1
     drawn = torch.stack([film.draw_reference(), film.draw(slice(last, last + 1))[0]]).numpy().astype(np.int16)
-    if np.abs(drawn - [recording.reference, recording.frames[last]]).max() > _ROUNDING:
+    # another device or library may draw the same scene with other grey levels, by one at most
+    if np.abs(drawn - [recording.reference, recording.frames[last]]).max() > 1:
         cause = "they were changed, or other versions of numpy and torch made them"
         raise InputError(f"trial {name} of {folder} is not drawn as it is stored: {cause}; simulate the data set again")
     return film

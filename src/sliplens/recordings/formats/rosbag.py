@@ -33,7 +33,6 @@ _ENCODINGS = {
     **{f"bayer_{order}8": (1, f"bayer_{order}8") for order in ("rggb", "bggr", "gbrg", "grbg")},
 }
 """Bytes a pixel of each encoding, and FFmpeg's name of its format."""
-_STORAGE = (".mcap", ".db3")
 _CLOCKS = ("header", "bag")  # of the stamp in a message, and of its arrival at the bag
 
 
@@ -75,7 +74,7 @@ def open_bag(path: Path) -> Iterator["Reader"]:
     require_packages("rosbags", extra="ros", purpose="a ROS 2 bag")
     from rosbags.rosbag2 import Reader  # noqa: PLC0415 (an extra)
 
-    files = sorted(file for file in path.iterdir() if file.suffix in _STORAGE) if path.is_dir() else [path]
+    files = sorted(file for file in path.iterdir() if file.suffix in {".mcap", ".db3"}) if path.is_dir() else [path]
     if path.is_dir() and not (path / "metadata.yaml").is_file():
         inside = " or ".join(file.name for file in files[:3]) or "the folder of a bag"
         raise RecordingError(f"{path} has no metadata.yaml; write it with `ros2 bag reindex`, or name {inside}")

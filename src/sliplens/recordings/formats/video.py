@@ -101,14 +101,11 @@ def _ends_early(
     if video.frames:  # AVI and MP4 say how many frames they hold
         return frames < video.frames
     # Matroska says how long it lasts, which may be the length of a sound stream
-    if not (container.format.name.startswith("matroska") and container.duration and len(container.streams) == 1):
+    alone = container.format.name.startswith("matroska") and len(container.streams) == 1
+    if time_s is None or not (alone and container.duration):
         return False
-    steps = [] if time_s is None else np.diff(time_s).tolist()
-    if video.average_rate:
-        steps.append(float(1 / video.average_rate))
-    if time_s is None or not steps:
-        return False
-    return float(time_s[-1]) + 1.5 * max(steps) < container.duration / av.time_base
+    steps = [*np.diff(time_s).tolist(), *([float(1 / video.average_rate)] if video.average_rate else [])]
+    return bool(steps) and float(time_s[-1]) + 1.5 * max(steps) < container.duration / av.time_base
 
 
 def _decode(
