@@ -116,7 +116,7 @@ class Friction:
         Exact friction stays; a slip far outside the possible values leaves the nearest of them.
         """
         if not (0 < ratio < math.inf and 0 < sigma < math.inf):
-            raise InputError(f"F_t / F_n at a slip and its sigma are positive; correct {ratio:g} +- {sigma:g}")
+            raise InputError(f"a slip needs a positive ratio F_t / F_n and sigma, got {ratio:g} and {sigma:g}")
         values, weights = self.nodes
         with np.errstate(divide="ignore"):
             posterior = np.log(weights) - 0.5 * ((values - ratio) / sigma) ** 2

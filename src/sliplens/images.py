@@ -27,9 +27,9 @@ IMAGE_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp"})
 _REDUCE = "divide its levels by 256, or by 16 or 4 where the camera gives 12 or 10 bits"
 _TAGGED = frozenset({"exif", "Raw profile type exif", "XML:com.adobe.xmp", "xmp"})
 """Entries of a header in which Pillow finds the tag; without any it would decode a PNG to search behind its pixels."""
-_DAMAGE = (OSError, SyntaxError, ValueError, MemoryError, Image.DecompressionBombError)  # what Pillow raises
 MOST_PIXELS = 100_000_000
 """Largest number of pixels: more mean a damaged header, and would need gigabytes."""
+_DAMAGE = (OSError, SyntaxError, ValueError, MemoryError, Image.DecompressionBombError)  # what Pillow raises
 
 
 def has_colour(image: UInt8[np.ndarray, "height width 3"]) -> bool:

@@ -55,9 +55,8 @@ def slide(
     first = int(np.searchsorted(since_slip_s, 0.0)) + stuck_until
     if first < len(time_s):
         # pulled no further, the contact holds at its last level and slips as the normal force falls
-        level[first:] = friction[first:] = carried[first:] = (
-            level[first - 1] / static_friction[first - 1] * (static_friction[first:])
-        )
+        last = level[first - 1] / static_friction[first - 1] * static_friction[first:]
+        level[first:] = friction[first:] = carried[first:] = last
         stuck[first:] = False
     before = since_slip_s < 0
     return ContactFriction(

@@ -163,9 +163,7 @@ class Grasp:
     """Depth of the sensor's markers under the skin, in radii of the contact's sphere."""
 
 
-_BUILT_IN = tuple(
-    f"sensor_{name}" for name in ("gain", "white_balance", "gradient", "glare", "shift_px", "rotation_deg")
-)
+_BUILT_IN = tuple(map("sensor_{}".format, ("gain", "white_balance", "gradient", "glare", "shift_px", "rotation_deg")))
 _DAILY = ("gain", "white_balance", "illumination_gradient", "glare", "camera_shift_px", "camera_rotation_deg")
 
 

@@ -435,9 +435,8 @@ def place_on_clock(
 ) -> tuple[Float[np.ndarray, " frames"], Forces | None, tuple[str, ...]]:
     """Return times of frames on the clock of the forces in the table beside them, these forces, and notes."""
     start_s = options.start_s
-    samples, notes = (
-        (None, ()) if options.forces is None else read_force_table(open_text_table(options.forces), options)
-    )
+    table = None if options.forces is None else open_text_table(options.forces)
+    samples, notes = (None, ()) if table is None else read_force_table(table, options)
     if start_s is not None:
         if not isfinite(start_s):
             raise RecordingError(f"the first frame cannot start at {start_s} s; give the time of the force clock")

@@ -155,9 +155,8 @@ def infer_axes(forces: Forces, settings: LabelSettings | None = None, *, moved_s
     axis = AXES[int(np.argmax(np.abs(main)))] if normal is None else normal
     first, second = np.sort(np.abs(press))[[-1, -2]]
     if normal is None and rise.bends and second > _DOUBTFUL * first:
-        notes.append(
-            f"the normal axis is doubtful: {axis} departs by {first:.2f} N, another by {second:.2f} N; declare it"
-        )
+        departs = f"{axis} departs by {first:.2f} N, another by {second:.2f} N"
+        notes.append(f"the normal axis is doubtful: {departs}; declare it")
     # ForceAxes refuses an unknown axis
     index = AXES.index(axis) if axis in AXES else 0
     inferred_sign = 1 if main[index] >= 0 else -1

@@ -120,13 +120,10 @@ def screen_forces(
             codes[good], shift[good] = _find_steps(rest, image_moves=image_moves)
     screened = _leave_out(forces, codes, shift)
     _, slips_s = _classify_jumps(screened.forces, image_moves=image_moves)
-    doubts = tuple(
-        f"the tangential force falls at {at_s:.2f} s while the image rests, which was taken for a slip; if "
-        "the sensor was knocked, mark the frames from there on as bad and give the friction with --mu"
-        for at_s in slips_s
-        if not image_moves(at_s, 0.0)
-    )
-    return replace(screened, doubts=doubts)
+    falls = [f"the tangential force falls at {at_s:.2f} s" for at_s in slips_s if not image_moves(at_s, 0.0)]
+    cure = "if the sensor was knocked, mark the frames from there on as bad and give the friction with --mu"
+    doubts = (f"{fall} while the image rests, which was taken for a slip; {cure}" for fall in falls)
+    return replace(screened, doubts=tuple(doubts))
 
 
 def screen_trial(

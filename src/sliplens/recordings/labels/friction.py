@@ -245,13 +245,10 @@ def _find_contradictions(
     if slip is not None:
         apart = abs(slip.mu - mu)
         if apart > max(LAW_SIGMAS * np.hypot(friction.sigma, slip.sigma), _LAW_SHARE * mu):
-            falls = (
-                f"F_t / F_n is {slip.mu:.2f} ({slip.low:.2f} to {slip.high:.2f}) at the slip at {slip.onset_s:.2f} s"
-            )
+            value = f"{slip.mu:.2f} ({slip.low:.2f} to {slip.high:.2f}) at the slip at {slip.onset_s:.2f} s"
             origin = "was given" if declared else f"follows from the slip that was set to {friction.onset_s:.2f} s"
-            notes.append(
-                f"{falls}, and a friction of {written} {origin}, {counts}; leave it out, or set --slip-s there"
-            )
+            differs = f"F_t / F_n is {value}, and a friction of {written} {origin}, {counts}"
+            notes.append(f"{differs}; leave it out, or set --slip-s there")
             error = apart
     highest = int(np.argmax(means.least))
     # the uncertainty of a friction that comes from these forces includes their tare
@@ -271,9 +268,8 @@ def _find_contradictions(
         after = ratio[(time > slip_s) & (time <= slip_s + 2 * _DROP_S) & means.pulled]
         if len(before) and len(after) and after.min() > (1 - _DROP_SHARE) * before.mean():
             levels = f"it is {before.mean():.2f} before it and at least {after.min():.2f} after it"
-            notes.append(
-                f"F_t / F_n does not fall at the slip that was set to {slip_s:.2f} s: {levels}; set it where it falls"
-            )
+            where = f"the slip that was set to {slip_s:.2f} s"
+            notes.append(f"F_t / F_n does not fall at {where}: {levels}; set it where it falls")
     return notes, error
 
 

@@ -51,11 +51,9 @@ def describe_repeats(motion: Float[np.ndarray, " frames"], time_s: Float[np.ndar
         return None
     rate_hz = (len(time_s) - 1) / float(time_s[-1] - time_s[0])
     taken_hz = rate_hz * (1 - repeats / len(motion))
-    return (
-        f"{repeats} of {len(motion)} frames repeat the one before: the camera took about {taken_hz:.3g} frames a "
-        f"second, and the file says {rate_hz:.3g}; record at the camera's rate, or leave the repeats out on export "
-        "(`ffmpeg -vf mpdecimate`)"
-    )
+    rates = f"the camera took about {taken_hz:.3g} frames a second, and the file says {rate_hz:.3g}"
+    cure = "record at the camera's rate, or leave the repeats out on export (`ffmpeg -vf mpdecimate`)"
+    return f"{repeats} of {len(motion)} frames repeat the one before: {rates}; {cure}"
 
 
 Intervals: TypeAlias = Float[np.ndarray, " intervals"]
@@ -164,10 +162,9 @@ def doubt_lag(lag: Lag | None, *, applied: bool, frame_s: float) -> str:
         return ""
     late = f"{'late' if lag.lag_s > 0 else 'early'} by {1000 * size_s:.0f} +- {1000 * lag.sigma_s:.0f} ms"
     measured = f"unknown: {lag.doubt}" if lag.doubt else f"{size_s / frame_s:.1f} frames"
-    return (
-        f"the camera is {late} ({measured}); check that the forces are those of this video, give --frame-rate or "
-        "--time-unit if a clock runs wrong, and --start-s, --lag-ms or --apply-lag if only its zero differs"
-    )
+    rate = "give --frame-rate or --time-unit if a clock runs wrong"
+    zero = "--start-s, --lag-ms or --apply-lag if only its zero differs"
+    return f"the camera is {late} ({measured}); check that the forces are those of this video, {rate}, and {zero}"
 
 
 def doubt_agreement(
@@ -192,10 +189,10 @@ def doubt_agreement(
             continue
         correlation = _agreement(change[some], image_motion[some])
         if correlation < _LEAST_CORRELATION:
-            doubts.append(
-                f"image and force do not move together from {time[some][0]:.2f} to {time[some][-1]:.2f} s (correlation "
-                f"{correlation:.2f}, {_LEAST_CORRELATION} is needed); check that the forces are those of this video"
-            )
+            span = f"from {time[some][0]:.2f} to {time[some][-1]:.2f} s"
+            why = f"(correlation {correlation:.2f}, {_LEAST_CORRELATION} is needed)"
+            cure = "check that the forces are those of this video"
+            doubts.append(f"image and force do not move together {span} {why}; {cure}")
     idle = covered & ~np.any(near, axis=0)
     if near and not doubts and idle.any():
         motion, (quantile, share) = image_motion[covered & ~idle], _MOVES
@@ -204,10 +201,8 @@ def doubt_agreement(
         if moves.sum() >= _LEAST_MOVES:
             at = time[moves]
             correlation = _agreement(change[idle], image_motion[idle])
-            doubts.append(
-                f"the image moves as in a contact from {at[0]:.2f} to {at[-1]:.2f} s, and the forces rest (correlation "
-                f"{correlation:.2f}); check that the force sensor ran"
-            )
+            span = f"from {at[0]:.2f} to {at[-1]:.2f} s, and the forces rest (correlation {correlation:.2f})"
+            doubts.append(f"the image moves as in a contact {span}; check that the force sensor ran")
     return tuple(doubts)
 
 
