@@ -20,8 +20,6 @@ from sliplens.explainers.cam import capture, find_layers
 from sliplens.intervals import paired_difference
 from sliplens.results.faithfulness import CHANCE, Lead
 
-_SAMPLES = 33
-
 
 def total_variation(saliency: Float[np.ndarray, "height width"]) -> float:
     """Mean absolute step between neighbouring pixels, over the range of the map: 1/3 for independent even noise."""
@@ -41,10 +39,10 @@ def resolution(saliency: Float[np.ndarray, "height width"], markers_px: Float[np
     pairs = {(min(first, second), max(first, second)) for first, second in np.asarray(nearest).tolist()}
     depths = []
     for first, second in sorted(pairs):
-        along = np.linspace(0, 1, _SAMPLES)[:, None]
+        along = np.linspace(0, 1, 33)[:, None]
         x, y = ((1 - along) * markers_px[first] + along * markers_px[second]).T
         values = map_coordinates(saliency, [y, x], order=1, mode="nearest")
-        third = _SAMPLES // 3
+        third = len(along) // 3
         peaks = (values[: third + 1].max(), values[-third - 1 :].max())
         if min(peaks) > 0:
             depths.append(1 - float(values[third:-third].min()) / float(min(peaks)))
@@ -117,11 +115,6 @@ def relevance_mass(saliency: Float[np.ndarray, "_ _"], truth: Bool[np.ndarray, "
 Images = Float[Tensor, "images colours height width"]
 ControlMaps = Float[Tensor, "images height width"]
 Maps = Float[np.ndarray, "images height width"]
-_QUARTER_GREY_LEVEL = 0.001
-"""Added to what is divided by: where nothing changed there is nothing to compare."""
-_SEEDS_APART = 1000
-"""Seeds that each network has for its layers, of which none has so many: those of no other network."""
-_BATCH_NORMS = (nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d, nn.SyncBatchNorm)
 
 
 def edges(images: Images) -> ControlMaps:
@@ -140,7 +133,7 @@ def relative_change(images: Images, references: Images) -> ControlMaps:
     """
     pairs = list(zip(images, references, strict=True))
     near, around = (torch.stack([local_change(*pair, widths=widths) for pair in pairs]) for widths in (1, 4))
-    return near / (around + _QUARTER_GREY_LEVEL)
+    return near / (around + 0.001)  # a quarter of a grey level: where nothing changed there is nothing to compare
 
 
 @torch.no_grad()
@@ -230,8 +223,8 @@ def cascade(model: nn.Module, *, seed: int, stages: int, images: Images) -> Iter
     ends = {round((stage + 1) * len(weighted) / stages) for stage in range(stages)}
     for count, module in enumerate(weighted, start=1):
         with torch.random.fork_rng(devices=[]):
-            # by its place, so that a layer gets the same weights whatever came before it
-            torch.manual_seed(_SEEDS_APART * seed + count - 1)
+            # by its place, so that a layer gets the same weights whatever came before it; no network has 1000 layers
+            torch.manual_seed(1000 * seed + count - 1)
             module.reset_parameters()  # pyright: ignore[reportCallIssue]
         if count in ends:
             _settle(changed, weighted[:count], images)
@@ -241,7 +234,7 @@ def cascade(model: nn.Module, *, seed: int, stages: int, images: Images) -> Iter
 @torch.no_grad()
 def _settle(model: nn.Module, changed: list[nn.Module], images: Tensor) -> None:
     """Give batch normalisation with new weights the statistics of some images."""
-    norms = [layer for layer in changed if isinstance(layer, _BATCH_NORMS)]
+    norms = [layer for layer in changed if isinstance(layer, nn.modules.batchnorm._BatchNorm)]
     momenta = [norm.momentum for norm in norms]
     for norm in norms:
         norm.reset_running_stats()

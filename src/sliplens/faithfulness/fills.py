@@ -128,10 +128,6 @@ def _static(fill: Callable[[Images], Images]) -> Fill:
     return prepare
 
 
-def _constant(level: float) -> Fill:
-    return _static(lambda images: torch.full_like(images, level))
-
-
 def _blurred(images: Images) -> Images:
     from torchvision.transforms.v2 import functional as transforms  # noqa: PLC0415 (takes a second)
 
@@ -154,9 +150,9 @@ def _noisy_linear(images: Images, _references: Images | None, seed: int) -> Pain
 
 
 _ROWS: dict[str, Fill] = {
-    "grey": _constant(0.5),
-    "black": _constant(0.0),
-    "white": _constant(1.0),
+    "grey": _static(lambda images: torch.full_like(images, 0.5)),
+    "black": _static(torch.zeros_like),
+    "white": _static(torch.ones_like),
     "background": _static(lambda images: images.flatten(2).median(dim=2).values[..., None, None].expand_as(images)),
     "blur": _static(_blurred),
     "reference": _reference,

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
 from sliplens.errors import InputError
-from sliplens.faithfulness.fills import Fill, Painter
+from sliplens.faithfulness.fills import Fill
 from sliplens.models.engines import Engine
 from sliplens.progress import report_each, report_progress
 from sliplens.results.explanation import require_saliency
@@ -56,11 +56,6 @@ def random_unit_order(units: Units, *, rng: np.random.Generator) -> Int[np.ndarr
     return np.argsort(rank[units.ravel()], kind="stable")
 
 
-def influence_orders(influence: Float[np.ndarray, "images markers"]) -> Int[np.ndarray, "2 images markers"]:
-    """Orders of the markers from the most influential on, and from the least, in which ties fall alike."""
-    return np.stack([np.argsort(sign * influence, axis=-1, kind="stable") for sign in (-1, 1)])
-
-
 def _name_curves(
     names: Iterable[str],
     answers: Float64[np.ndarray, "orders images steps"],
@@ -86,34 +81,14 @@ def _as_engine(predict: Predict) -> Engine:
 
 
 @torch.no_grad()
-def _answer(
-    engine: Engine, batches: Iterable[Tensor], on_batch: Callable[[int], None] = lambda _: None
-) -> Float64[np.ndarray, " images"]:
-    answers = [np.empty(0)]
-    for margins in engine.run(batches):
-        answers.append(margins.cpu().double().numpy())
-        on_batch(len(margins))
-    return np.concatenate(answers)
+def _answer(engine: Engine, batches: Iterable[Tensor]) -> Float64[np.ndarray, " images"]:
+    return np.concatenate([np.empty(0), *(margins.cpu().double().numpy() for margins in engine.run(batches))])
 
 
 def answer_whole(predict: Predict, images: Tensor) -> Float64[np.ndarray, " images"]:
     """Predict whole images."""
     engine = _as_engine(predict)
     return _answer(engine, images.split(engine.batch_size))
-
-
-def _paint(
-    paint: Painter, orders: np.ndarray, jobs: Sequence[tuple[int, int, int]], *, images: Tensor, batch_size: int
-) -> Iterator[Tensor]:
-    """Yield images of which parts are gone, a batch at a time; jobs are image, order and pixels removed."""
-    size = images.shape[-2:]
-    for start in range(0, len(jobs), batch_size):
-        batch = jobs[start : start + batch_size]
-        gone = torch.zeros((len(batch), size.numel()), dtype=torch.bool)
-        for row, (image, order, pixels) in enumerate(batch):
-            gone[row, torch.from_numpy(orders[order, image, :pixels])] = True
-        rows = torch.tensor([image for image, _, _ in batch], device=images.device)
-        yield paint(rows, gone.view(-1, *size).to(images.device))
 
 
 def removal_curves(
@@ -131,24 +106,27 @@ def removal_curves(
     Inputs are in [0, 1], as the references, those of the baseline, where the fill needs them. Orders are flat
     pixel indices, first to be removed first (`unit_order`); areas are shares of the image, rising from 0 to 1.
     """
-    shares = np.asarray(areas, dtype=np.float64)
-    removed = np.round(shares * images.shape[-2] * images.shape[-1]).astype(np.int64).tolist()
-    last, jobs, engine, done = len(shares) - 1, [], _as_engine(predict), 0
+    shares, size = np.asarray(areas, dtype=np.float64), images.shape[-2:]
+    removed = np.round(shares * size[0] * size[1]).astype(np.int64).tolist()
+    last, jobs, engine, paint = len(shares) - 1, [], _as_engine(predict), fill(images, references, seed)
     for image in range(len(images)):
         jobs += [(image, order, step) for order in range(len(orders)) for step in range(1, last)]
         # what is left of the image when all is gone depends on no order: answered once
         jobs.append((image, 0, last))
 
-    def count(answered: int) -> None:
-        nonlocal done
-        done += answered
-        report_progress(done * len(images) // len(jobs), len(images))
+    def paint_jobs() -> Iterator[Tensor]:
+        for start in range(0, len(jobs), engine.batch_size):
+            batch = jobs[start : start + engine.batch_size]
+            gone = torch.zeros((len(batch), size.numel()), dtype=torch.bool)
+            for row, (image, order, step) in enumerate(batch):
+                gone[row, torch.from_numpy(orders[order, image, : removed[step]])] = True
+            rows = torch.tensor([image for image, _, _ in batch], device=images.device)
+            yield paint(rows, gone.view(-1, *size).to(images.device))
+            report_progress((start + len(batch)) * len(images) // len(jobs), len(images))
 
-    paint, steps = fill(images, references, seed), [(image, order, removed[step]) for image, order, step in jobs]
-    batches = _paint(paint, orders, steps, images=images, batch_size=engine.batch_size)
     answers = np.empty((len(orders), len(images), len(shares)))
     image_of, order_of, step_of = np.transpose(jobs)
-    answers[order_of, image_of, step_of] = _answer(engine, batches, count)
+    answers[order_of, image_of, step_of] = _answer(engine, paint_jobs())
     answers[:, :, 0] = answer_whole(engine, images)
     answers[:, :, -1] = answers[0, :, -1]
     return answers
@@ -207,24 +185,6 @@ def answer_scenes(
     return answer
 
 
-def marker_curves(
-    predict: Predict, redraw: Redraw, orders: Int[np.ndarray, "orders images markers"]
-) -> Float64[np.ndarray, "orders images shares"]:
-    """Predict frames while `SHARES` of their markers are put back, in several orders each.
-
-    Scenes that several orders share are drawn once.
-    """
-    _, images, markers = orders.shape
-    counts = np.round(np.asarray(SHARES) * markers).astype(np.int64)
-    answers = np.empty((len(orders), images, len(counts)))
-    for image in report_each(range(images)):
-        rank = np.argsort(orders[:, image], axis=-1)
-        back = rank[:, None] < counts[:, None]
-        answer = answer_scenes(predict, partial(redraw, image))
-        answers[:, image] = answer(back.reshape(-1, markers)).reshape(back.shape[:2])
-    return answers
-
-
 def score_maps_by_marker(
     predict: Predict,
     redraw: Redraw,
@@ -238,8 +198,16 @@ def score_maps_by_marker(
     for name, values in influence.items():
         if not np.isfinite(values).all():
             raise InputError(f"{name} gives some marker no finite influence; leave out markers that no pixel shows")
-    orders = [influence_orders(values) for values in influence.values()]
-    images, markers = orders[0].shape[1:]
-    orders += [np.array([[rng.permutation(markers) for _ in range(images)]]) for _ in range(random_orders)]
-    answers = marker_curves(predict, redraw, np.concatenate(orders))
+    # ties fall alike in both orders
+    signed = [sign * values for values in influence.values() for sign in (-1, 1)]
+    images, markers = signed[0].shape
+    orders = [np.argsort(values, axis=-1, kind="stable") for values in signed]
+    orders += [np.stack([rng.permutation(markers) for _ in range(images)]) for _ in range(random_orders)]
+    counts = np.round(np.asarray(SHARES) * markers).astype(np.int64)
+    answers = np.empty((len(orders), images, len(counts)))
+    for image in report_each(range(images)):
+        rank = np.argsort([order[image] for order in orders], axis=-1)
+        back = rank[:, None] < counts[:, None]
+        answer = answer_scenes(predict, partial(redraw, image))  # draws what several orders share once
+        answers[:, image] = answer(back.reshape(-1, markers)).reshape(back.shape[:2])
     return _name_curves(influence, answers, SHARES, towards)

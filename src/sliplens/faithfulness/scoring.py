@@ -20,8 +20,6 @@ from sliplens.results.explanation import BASELINES, CLOSE, Explanation
 from sliplens.results.faithfulness import CHANCE, RemovalCurve, is_control
 from sliplens.results.study import REDRAWN, Setting
 
-_CHECKED_IMAGES = 4
-
 
 def require_same_network(network: Network, explanation: Explanation) -> None:
     """Raise an error for explanations of another network."""
@@ -33,7 +31,7 @@ def require_same_network(network: Network, explanation: Explanation) -> None:
 
 def prepare_passes(network: Network, inputs: Float[Tensor, "images colours size size"], passes: int) -> Engine:
     """Prepare an engine for a number of passes of a network, checked on a few of its inputs, on its device."""
-    return prepare(network.model, inputs[:_CHECKED_IMAGES].to(network.device), passes=passes)
+    return prepare(network.model, inputs[:4].to(network.device), passes=passes)
 
 
 def influences(network: Network, explanation: Explanation) -> dict[str, Maps]:
@@ -284,32 +282,14 @@ def flat_maps(maps: Mapping[str, Float[np.ndarray, "images height width"]]) -> l
     return alarms
 
 
-def rankings_disagree(scores: Mapping[str, Mapping[str, float]]) -> list[str]:
-    """Warn of fills that rank the methods differently, by Kendall's tau; scores by fill, then by method.
+def ranking_alarms(gains: Mapping[Setting, Mapping[str, float]]) -> list[str]:
+    """Warn where a control wins, and of fills that rank the methods differently; mean gains by setting and name.
 
     Kendall, *A new measure of rank correlation* (1938).
     """
     from scipy.stats import kendalltau  # noqa: PLC0415 (takes a second)
 
-    alarms = []
-    for first, second in combinations(scores, 2):
-        methods = sorted(set(scores[first]) & set(scores[second]))
-        if len(methods) < _FEWEST:
-            continue
-        ranked = ([scores[fill][method] for method in methods] for fill in (first, second))
-        tau = float(np.asarray(kendalltau(*ranked))[0])
-        if not tau >= _SAME_ORDER:
-            alarms.append(
-                f"{first} and {second} rank the methods differently (Kendall's tau {tau:.2f}): which is best depends "
-                "on what removed pixels become"
-            )
-    return alarms
-
-
-def ranking_alarms(gains: Mapping[Setting, Mapping[str, float]]) -> list[str]:
-    """Warn where a control wins, and of fills that rank the methods differently; mean gains by setting and name."""
-    by_fill: dict[str, dict[str, float]] = {}
-    alarms = []
+    by_fill, alarms, doubts = dict[str, dict[str, float]](), [], []
     for setting, of_setting in gains.items():
         methods = {name: gain for name, gain in of_setting.items() if not is_control(name)}
         best = max(of_setting.keys() - methods.keys(), key=lambda name: of_setting[name], default=None)
@@ -322,4 +302,12 @@ def ranking_alarms(gains: Mapping[Setting, Mapping[str, float]]) -> list[str]:
                 alarms.append(f"{where}: {name} gains {gain:.3f}, no more than {control}")
         if setting.unit == "pixel":
             by_fill[setting.fill] = methods
-    return [*rankings_disagree(by_fill), *alarms]
+    for (first, gains_of_first), (second, gains_of_second) in combinations(by_fill.items(), 2):
+        common = [(gain, gains_of_second[name]) for name, gain in gains_of_first.items() if name in gains_of_second]
+        tau = float(np.asarray(kendalltau(*np.transpose(common)))[0]) if len(common) >= _FEWEST else 1.0
+        if not tau >= _SAME_ORDER:
+            doubts.append(
+                f"{first} and {second} rank the methods differently (Kendall's tau {tau:.2f}): which is best depends "
+                "on what removed pixels become"
+            )
+    return [*doubts, *alarms]
