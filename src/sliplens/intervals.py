@@ -99,13 +99,16 @@ def paired_difference(
     counts = [int(level.max()) + 1 for level in levels]
     free: list[Int[np.ndarray, " images"]] = []
     for level in levels:
-        if level.max() and not any(_within(level, outer) for outer in free):
+        # of clusters that each lie in a single outer one the spread is in that of the outer ones
+        cells = (len(np.unique(level * (outer.max() + 1) + outer)) for outer in free)
+        if level.max() and level.max() + 1 not in cells:
             free.append(level)
     over = dict(zip(("units", "days", "networks"), counts[::-1], strict=False))
     estimate = float(gap.mean())
     low_tail, high_tail = np.broadcast_to(0.025 / np.array(comparisons), 2)
     at = np.array([low_tail, 1 - high_tail])
-    ends = _drawn_ends(gap, free[0], at, rng) if len(free) == 1 else _student_ends(gap, free, at)
+    many = len(free) == 1 and free[0].max() >= _FEWEST_DRAWN - 1
+    ends = _drawn_ends(gap, free[0], at, rng) if many else _student_ends(gap, free, at)
     low, high = (None, None) if ends is None else (estimate + ends).tolist()
     return Difference(estimate=estimate, low=low, high=high, **over)
 
@@ -134,15 +137,8 @@ def mean_interval(
     (0.7, -1.0, 1.0)
     """
     interval = paired_difference(values, np.zeros(len(values)), clusters=clusters, rng=rng)
-    if interval.low is None or interval.high is None:
-        return interval
-    low, high = max(interval.low, limits[0]), min(interval.high, limits[1])
-    return replace(interval, low=float(low), high=float(high))
-
-
-def _within(inner: Int[np.ndarray, " images"], outer: Int[np.ndarray, " images"]) -> bool:
-    """Return True if each inner cluster lies in a single outer one, whose spread then includes its own."""
-    return len(np.unique(inner * (outer.max() + 1) + outer)) == int(inner.max()) + 1
+    low, high = (None if end is None else float(np.clip(end, *limits)) for end in (interval.low, interval.high))
+    return replace(interval, low=low, high=high)
 
 
 def _drawn_ends(
@@ -150,11 +146,9 @@ def _drawn_ends(
     level: Int[np.ndarray, " images"],
     at: Float[np.ndarray, " 2"],
     rng: np.random.Generator,
-) -> Float[np.ndarray, " 2"] | None:
-    """Ends of the interval, at these quantiles, less the estimate; clusters are drawn again where there are enough."""
+) -> Float[np.ndarray, " 2"]:
+    """Ends of the interval, at these quantiles, less the estimate; clusters are drawn again."""
     sums, counts = np.bincount(level, weights=gap), np.bincount(level)
-    if len(sums) < _FEWEST_DRAWN:
-        return _student_ends(gap, [level], at)
     # the clusters as they are, then drawn again
     rows = np.concatenate([np.arange(len(sums))[None], rng.integers(0, len(sums), size=(_RESAMPLES, len(sums)))])
     sizes = counts[rows].sum(axis=1)

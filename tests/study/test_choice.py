@@ -114,21 +114,22 @@ def test_a_trial_without_markers_is_named_and_the_result_comes_back(choice: Choi
         assert one.markers == {}
 
 
-def test_a_marker_stands_halfway_and_scales_with_the_image():
+def test_a_marker_stands_halfway_and_scales_with_the_image(network: Network):
     # a grid of pitch 20 that moved by 4 to the right, seen at half the size: edges stay edges, centres by half a pixel
     x, y = np.meshgrid(np.arange(10, 100, 20.0), np.arange(10, 100, 20.0))
     rest = np.stack([x.ravel(), y.ravel()], axis=1)
     markers = marker_table(rest, rest + np.array([4.0, 0.0]))
-    centres, reach = choosing.network_places(markers, frame_size=(100, 100), image_size=50)
+    manifest = replace(network.manifest, frame_size=(100, 100), image_size=50)
+    centres, reach = choosing.network_places(markers, manifest)
     np.testing.assert_allclose(centres, (rest + np.array([2.0, 0.0]) + 0.5) / 2 - 0.5)
     assert reach == pytest.approx(5.0)
 
 
-def test_markers_that_were_lost_are_left_out():
+def test_markers_that_were_lost_are_left_out(network: Network):
     rest = np.array([[10.0, 10.0], [30.0, 10.0], [50.0, 10.0]])
-    now = rest.copy()
-    now[1] = np.nan
-    centres, reach = choosing.network_places(marker_table(rest, now), frame_size=(60, 60), image_size=60)
+    now = np.where([[False], [True], [False]], np.nan, rest)
+    manifest = replace(network.manifest, frame_size=(60, 60), image_size=60)
+    centres, reach = choosing.network_places(marker_table(rest, now), manifest)
     np.testing.assert_allclose(centres, rest[[0, 2]])
     assert reach == pytest.approx(20.0)
 

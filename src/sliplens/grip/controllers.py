@@ -193,7 +193,6 @@ CONTROLLERS = Table(
     },
 )
 """Controllers by name; an installed package adds its own by the entry point `sliplens.controllers`."""
-_FRICTION_KNOWN = {"zero": 0.0, "target": 0.6}  # of margin laws: the prediction is then the margin itself
 
 
 def make_controller(
@@ -213,7 +212,7 @@ def make_controller(
         return controller
     kind, settings = CONTROLLERS.pick(controller), dict(settings or {})
     if friction_known and issubclass(kind, MarginLaw):
-        settings = _FRICTION_KNOWN | settings
+        settings = {"zero": 0.0, "target": 0.6} | settings  # the prediction is then the margin itself
     constants = [item.name for item in fields(kind) if item.init]  # pyright: ignore[reportArgumentType]
     for constant, value in settings.items():
         if constant not in constants:

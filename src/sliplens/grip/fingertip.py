@@ -292,7 +292,6 @@ def load_readings(run: Network) -> ReadingTable:
 
 Markers: TypeAlias = Float[np.ndarray, "_ _ 2"]
 """Positions of a fingertip's markers, in pixels (x, y), by episode and marker."""
-_GAUSSIAN_90 = 1.645  # standard deviations to either side that hold 90 % of a Gaussian
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -380,7 +379,7 @@ def _margin_of_ratio(ratio: Fingers, sigma: Fingers, learners: Sequence[SlipLear
     margins = np.clip(1 - ratio[..., None] / values, 0, 1)
     margin = (weights * margins).sum(axis=-1)
     variance = (weights * ((margins - margin[..., None]) ** 2 + (sigma[..., None] / values) ** 2)).sum(axis=-1)
-    reach = _GAUSSIAN_90 * np.sqrt(variance)
+    reach = 1.645 * np.sqrt(variance)  # 90 % of a Gaussian
     return margin, margin - reach, margin + reach
 
 

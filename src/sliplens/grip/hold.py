@@ -169,7 +169,16 @@ class HoldLoop:
         self.steps: list[HoldStep] = []
         self.troubles: dict[str, None] = {}
         """Faults of the gripper, in the order in which they first came."""
-        force_n = self._first_force()
+        for _ in range(_TRIES):
+            state, trouble = self._measure()
+            if not math.isnan(state.force_n):
+                break
+            time.sleep(PERIOD_S)
+        else:
+            raise GripperError(
+                f"the gripper measures no force to begin with ({trouble or 'not a number'}), and got no command; check "
+                "its connection"
+            )
         self._closing: tuple[float, float, float] | None = None
         """Time of the last motion of the fingers without any force, and the range of their opening since; None once
         they pressed."""
@@ -177,7 +186,7 @@ class HoldLoop:
             controller,
             settings=settings,
             ceiling_n=guard.ceiling_n,
-            command_n=min(max(force_n, 0.0), guard.ceiling_n),  # what is held already stays held
+            command_n=min(max(state.force_n, 0.0), guard.ceiling_n),  # what is held already stays held
             fingers=len(readers),
         )
 
@@ -221,19 +230,6 @@ class HoldLoop:
             step = replace(decision, time_s=now_s - begun_s, trouble=trouble)
             self.steps.append(replace(step, readings=()))
         return step
-
-    def _first_force(self) -> float:
-        """Measure the grip force before any command; a driver may start late."""
-        trouble = None
-        for _ in range(_TRIES):
-            state, trouble = self._measure()
-            if not math.isnan(state.force_n):
-                return state.force_n
-            time.sleep(PERIOD_S)
-        raise GripperError(
-            f"the gripper measures no force to begin with ({trouble or 'not a number'}), and got no command; check its "
-            "connection"
-        )
 
     def _measure(self) -> tuple[GripperState, str | None]:
         """Return the state of the gripper, NaN where it gives none, and its fault."""

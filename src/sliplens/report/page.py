@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from hashlib import sha256
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -83,7 +82,17 @@ def write_report(
     opening = sections.build_opening(results, judge_study(results))
     blocks = [*opening.blocks, *(block for section in built for block in section.blocks)]
     runs = list(results.runs.values())
-    text = render_page(
+    loader = PackageLoader("sliplens.report")
+    # every text is escaped, and only the style of the package works on the page
+    pages = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    # what stands between backticks is code
+    pages.filters["code"] = lambda words: Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(words))))
+    css = (files("sliplens.report") / "templates" / "report.css").read_text(encoding="utf-8")
+    code = b64encode(sha256(css.encode()).digest()).decode()
+    allowed = "img-src data:", f"style-src 'sha256-{code}'", "base-uri 'none'", "form-action 'none'"
+    text = pages.get_template("report.html.j2").render(
+        policy="; ".join(["default-src 'none'", *allowed]),
+        style=css,
         name=results.folder.resolve().name,
         finished=runs[-1].finished[:16].replace("T", " at "),
         thesis=CITATION,
@@ -91,7 +100,7 @@ def write_report(
         opening=opening,
         verdict=[
             *([sections.table_accuracy(results)] if results.evaluations else []),
-            *([sections.table_claims(_VERDICT, claims)] if (claims := judge_results(results, rng=rng)) else []),
+            *([sections.table_claims(_VERDICT, claims)] if (claims := [*judge_results(results, rng=rng)]) else []),
         ],
         cautions=[*weak, *cautions(results)],
         alarms=sections.list_alarms(results),
@@ -107,16 +116,3 @@ def write_report(
     with written_whole(page) as part:
         part.write_text(text, encoding="utf-8")
     return Written(page=page, figures=figures)
-
-
-def render_page(**values: Any) -> str:
-    """Fill the template of the page: every text is escaped, and only the style of the package works on it."""
-    loader = PackageLoader("sliplens.report")
-    pages = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    # what stands between backticks is code
-    pages.filters["code"] = lambda words: Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(words))))
-    style = (files("sliplens.report") / "templates" / "report.css").read_text(encoding="utf-8")
-    code = b64encode(sha256(style.encode()).digest()).decode()
-    allowed = "img-src data:", f"style-src 'sha256-{code}'", "base-uri 'none'", "form-action 'none'"
-    policy = "; ".join(["default-src 'none'", *allowed])
-    return pages.get_template("report.html.j2").render(policy=policy, style=style, **values)

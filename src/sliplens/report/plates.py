@@ -24,7 +24,6 @@ FOLDER = "figures"
 """Beside the page."""
 _MOST_FRAMES = 6
 _THESIS_NUMBERS = {"difference": 15, "raw": 16}
-_FEW = 4  # charts in a row
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,8 +78,8 @@ def write_plates(plates: Sequence[Plate], folder: Path) -> tuple[Path, ...]:
 
 
 def _make_charts(count: int, *, each: tuple[float, float]) -> tuple[Figure, list[Axes]]:
-    """Make a figure of some charts, at most `_FEW` in a row."""
-    wide = min(count, _FEW)
+    """Make a figure of some charts, at most four in a row."""
+    wide = min(count, 4)
     high = -(-count // wide)
     with style.drawing_style():
         figure = Figure(figsize=(each[0] * wide, each[1] * high), layout="constrained")

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 from sliplens.plots import style
-from sliplens.plots.style import fill_name, input_name, inputs_in_order, listed
 from sliplens.report import plates, verdict
 from sliplens.results.explanation import BASELINES
 from sliplens.results.faithfulness import DeletionScores, Faithfulness, RemovalScore, is_control
@@ -341,7 +340,7 @@ def missing_sections(results: Study, sections: Sequence[Section]) -> list[str]:
 
 def _names(names: Iterable[str]) -> list[str]:
     """Difference before raw, as in the thesis's figures, and before both what it had not."""
-    return inputs_in_order(names)[::-1]
+    return style.inputs_in_order(names)[::-1]
 
 
 def list_alarms(results: Study) -> list[str]:
@@ -355,8 +354,8 @@ def list_alarms(results: Study) -> list[str]:
         for maps in (table[name] for table in (explained, results.real) if name in table):
             texts += [f"{method}: {text}" for method, notes in maps.methods.items() for text in notes.warnings]
         truth = results.truth.get(name)
-        if unfit := [fill_name(test.fill) for test in (truth.meta if truth else ()) if not test.holds]:
+        if unfit := [style.fill_name(test.fill) for test in (truth.meta if truth else ()) if not test.holds]:
             why = "a map of the Shapley values does not gain more than the same map with half of the markers shuffled"
-            texts.append(f"under {listed(unfit)} {why}, so that this fill has no vote")
-        alarms += [f"{input_name(name)}: {text.rstrip('.')}." for text in texts]
+            texts.append(f"under {style.listed(unfit)} {why}, so that this fill has no vote")
+        alarms += [f"{style.input_name(name)}: {text.rstrip('.')}." for text in texts]
     return list(dict.fromkeys(alarms))

@@ -11,8 +11,8 @@ the third digit of the recorded scores, the seconds on an RTX 3060 Ti and withou
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from importlib.resources import as_file, files
 from itertools import combinations
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -303,12 +303,8 @@ def judge_accuracy(score: RegressionScores) -> Outcome:
     return "holds" if score.r2 > 0 else "does not hold"
 
 
-def judge_results(results: Study, *, rng: np.random.Generator) -> tuple[ClaimRow, ...]:
+def judge_results(results: Study, *, rng: np.random.Generator) -> Iterator[ClaimRow]:
     """Compare the errors of the networks of a workspace, and judge how they predict real touch."""
-    return *_judge_networks(results, rng=rng), *_judge_real_touch(results)
-
-
-def _judge_networks(results: Study, *, rng: np.random.Generator) -> Iterator[ClaimRow]:
     evaluations = results.evaluations
     scores = {name: evaluations[name].conditions for name in style.inputs_in_order(evaluations)}
     for pair in combinations(scores, 2):
@@ -324,9 +320,6 @@ def _judge_networks(results: Study, *, rng: np.random.Generator) -> Iterator[Cla
                 why=f"Difference of the MSE, {over}.",
                 ours=write_gap(gap, digits=4),
             )
-
-
-def _judge_real_touch(results: Study) -> Iterator[ClaimRow]:
     real = results.real or (results.explanations if results.source == "real" else {})
     for name in style.inputs_in_order(real):
         frames = [frame for frame in real[name].frames if frame.safety_margin is not None]
@@ -371,5 +364,4 @@ class ThesisRecord:
 @cache
 def load_thesis() -> ThesisRecord:
     """Load the record that comes with the package."""
-    with as_file(files("sliplens.report") / "thesis.json") as path:
-        return load_record(path, ThesisRecord, command="python benchmarks/claims.py")
+    return load_record(Path(__file__).with_name("thesis.json"), ThesisRecord, command="python benchmarks/claims.py")

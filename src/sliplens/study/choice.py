@@ -14,12 +14,11 @@ from sliplens.explainers.contract import Explainer
 from sliplens.explainers.frames import MARGIN_LEVELS as LEVELS
 from sliplens.explainers.frames import nearest_frame
 from sliplens.explainers.occlusion import RegionMethod, marker_regions, tile_regions, to_network_px
-from sliplens.explainers.poly_cam import Likeness
 from sliplens.explainers.table import get_explainer
 from sliplens.faithfulness.removal import Units
 from sliplens.intervals import FEWEST_UNITS
 from sliplens.markers import track_markers
-from sliplens.models import Network
+from sliplens.models import Manifest, Network
 from sliplens.progress import number_of, report_each
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.results import study as records
@@ -149,9 +148,7 @@ def show_states(choice: Choice, data: Dataset) -> records.States:
     return records.States(untracked=tuple(untracked), table=table)
 
 
-def network_places(
-    markers: MarkerTable, *, frame_size: Sequence[int], image_size: int
-) -> tuple[Float[np.ndarray, "seen 2"], float]:
+def network_places(markers: MarkerTable, manifest: Manifest) -> tuple[Float[np.ndarray, "seen 2"], float]:
     """Where a network sees the markers (x, y), and how far each one's surroundings reach, in its own pixels.
 
     A difference image shows a marker where it was and where it is; so its place is half-way, and half of the pitch, the
@@ -159,7 +156,7 @@ def network_places(
     """
     middle = np.stack([markers.rest_x_px + markers.x_px, markers.rest_y_px + markers.y_px], axis=1) / 2
     middle = middle[np.isfinite(middle).all(axis=1)]
-    centres = to_network_px(middle, frame_size, image_size=image_size).numpy()
+    centres = to_network_px(middle, manifest.frame_size, image_size=manifest.image_size).numpy()
     between = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
     np.fill_diagonal(between, np.inf)
     return centres, float(np.median(between.min(axis=1))) / 2
@@ -172,15 +169,12 @@ def marker_sums(
     return np.bincount(regions.ravel(), relevance.astype(np.float64).ravel(), minlength=markers + 1)[:markers]
 
 
-_AS_PUBLISHED: Likeness = (0.999, 0.97)
-"""Of the thesis's map, compared with what was published; its weights are nearly all 1, so that this costs little."""
-
-
 def study_explainers(methods: Sequence[str], *, budget: float = records.STUDY_BUDGET) -> dict[str, Explainer]:
     """Explainers of a study: rows of `EXPLAINERS`, Poly-CAM with some of the channels measured at first."""
     rows: dict[str, Explainer] = {
         "poly-cam": get_explainer("poly-cam", budget=budget),
-        "poly-cam-thesis": get_explainer("poly-cam-thesis", budget=budget, likeness=_AS_PUBLISHED),
+        # compared with what was published; its weights are nearly all 1, so that this costs little
+        "poly-cam-thesis": get_explainer("poly-cam-thesis", budget=budget, likeness=(0.999, 0.97)),
     }
     return {name: rows.get(name) or get_explainer(name) for name in methods}
 
@@ -191,20 +185,15 @@ def without_markers(explainers: Mapping[str, Explainer]) -> dict[str, Explainer]
     return {name: get_explainer(name) if isinstance(row, RegionMethod) else row for name, row in by_tile.items()}
 
 
-_TILE_PX = 16
-
-
 def removal_units(
     trained: Network, explained: Explanation, markers: Mapping[str, MarkerTable]
 ) -> dict[str, list[Units]]:
     """Units of removal of each frame: pixels, tiles, and markers where they are known in every frame."""
-    shape, frame_size = (explained.image_size, explained.image_size), trained.manifest.frame_size
-    sides = {"pixel": 1, "tile": max(1, round(_TILE_PX * shape[0] / 224))}
+    shape = (explained.image_size, explained.image_size)
+    sides = {"pixel": 1, "tile": max(1, round(16 * shape[0] / 224))}  # 16 pixels of 224
     units = {name: [tile_regions(shape, tile_px=side).numpy()] * len(explained.frames) for name, side in sides.items()}
     if all(frame.id in markers for frame in explained.frames):
-        discs = [
-            network_places(markers[frame.id], frame_size=frame_size, image_size=shape[0]) for frame in explained.frames
-        ]
+        discs = [network_places(markers[frame.id], trained.manifest) for frame in explained.frames]
         units["marker"] = [
             marker_regions(shape, torch.from_numpy(centres), radius_px=reach).numpy() for centres, reach in discs
         ]
@@ -231,7 +220,6 @@ def marker_places(
     trained: Network, frames: Sequence[str], markers: Mapping[str, MarkerTable]
 ) -> list[Float[Tensor, "_markers 2"]]:
     """Where the markers of each frame are, in the network's pixels; those that were not followed are left out."""
-    now = [np.stack([markers[frame].x_px, markers[frame].y_px], axis=1) for frame in frames]
+    now, manifest = [np.stack([markers[frame].x_px, markers[frame].y_px], axis=1) for frame in frames], trained.manifest
     valid = [places[np.isfinite(places).all(axis=1)] for places in now]
-    manifest = trained.manifest
     return [to_network_px(places, manifest.frame_size, image_size=manifest.image_size) for places in valid]

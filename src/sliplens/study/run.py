@@ -125,12 +125,12 @@ def run_study(
         for step in SHARED:
             _run_step(step, records)
         write_json(records.folder / results.CONFIG_FILE, config)
-        steps = [step for step in _required_steps(config.tests) if step not in SHARED]
-        if records.not_redrawn and "truth" in steps:
-            steps.remove("truth")
-            if data.simulated:
-                add_note(f"the truth is left out, since {records.not_redrawn}")
-        for of_network, step in product(of_networks, steps):
+        tests = {*config.tests} - ({"truth"} if records.not_redrawn else set())
+        if data.simulated and tests != {*config.tests}:
+            add_note(f"the truth is left out, since {records.not_redrawn}")
+        # frames are explained in any case, and two tests need the controls
+        needed = {"explain", *tests} | ({"control"} if {"faithfulness", "truth"} & {*config.tests} else set())
+        for of_network, step in product(of_networks, [name for name in STUDY if name in needed]):
             _run_step(step, of_network)
         study = results.load_results(records.folder)
         for sentence in (records["choice"].summary, *study.left_out.values()):
@@ -350,12 +350,6 @@ STUDY: dict[str, Step] = {
     "truth": Step(JudgingByTruth.title, judge_by_truth),
 }
 """Steps of a study in their order."""
-
-
-def _required_steps(tests: Sequence[str]) -> list[str]:
-    """Return the steps of some tests, the controls where they need them; frames are explained in any case."""
-    needed = {*SHARED, "explain", *tests} | ({"control"} if {"faithfulness", "truth"} & set(tests) else set())
-    return [name for name in STUDY if name in needed]
 
 
 class _StepWork(Work):

@@ -46,7 +46,6 @@ STUDY_AREAS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)
 """Fewer shares than `AREAS`, so that many settings can be scored: enough for trapezoids."""
 STUDY_ORDERS = 10
 """Random orders that every method of a study has to beat."""
-_TILES_ACROSS = 14
 Influence: TypeAlias = Mapping[str, controls.Maps]
 """Maps that rank parts, of each method and control."""
 Maps: TypeAlias = Float[np.ndarray, "maps rows columns"] | Float[Tensor, "maps rows columns"] | Path | str
@@ -138,7 +137,7 @@ def score(
     explanation = _to_score(network, frames, maps, reference, signed=signed)
     scoring.require_same_network(network, explanation)
     shape = (explanation.image_size, explanation.image_size)
-    units = tile_regions(shape, tile_px=1 if unit == "pixel" else max(1, shape[0] // _TILES_ACROSS)).numpy()
+    units = tile_regions(shape, tile_px=1 if unit == "pixel" else max(1, shape[0] // 14)).numpy()
     removal = Removal(
         trained=network,
         explained=explanation,
@@ -342,7 +341,6 @@ class PixelDeletion(Stage[DeletionScores]):
         return scoring.score_deletion(self.explained, join_trials(self.explained, records), fill=self.fill)
 
 
-_FEW_CHANNELS, _FEW_PAIRS = 0.05, 100
 _FEW_FRAMES = 2  # on which infidelity and sensitivity are measured
 
 
@@ -355,15 +353,13 @@ def measure_maps(
     seed: int = 0,
 ) -> MapQuality:
     """Measure resolution, smoothness, infidelity and sensitivity of the maps, and compare the methods' smoothness."""
-    rng, model, size = np.random.default_rng(seed), trained.model, trained.manifest.frame_size
+    rng, model = np.random.default_rng(seed), trained.model
     few, compared = (of(trained, explained)[:_FEW_FRAMES] for of in (network_inputs, network_references))
     measures, roughness = {}, {}
     for method in report_each(list(explainers)):
         maps = explained.saliency[method].astype(np.float64)
         resolutions = [
-            controls.resolution(
-                saliency, network_places(markers[frame.id], frame_size=size, image_size=explained.image_size)[0]
-            )
+            controls.resolution(saliency, network_places(markers[frame.id], trained.manifest)[0])
             for saliency, frame in zip(maps, explained.frames, strict=True)
             if frame.id in markers
         ]
@@ -401,10 +397,10 @@ def measure_maps(
 def _shortened(explainer: Explainer) -> Explainer:
     """Spare passes that a map of new weights does not need: few channels or pairs, no checks."""
     if isinstance(explainer, PolyCam):
-        return replace(explainer, likeness=None, budget=min(explainer.budget, _FEW_CHANNELS))
+        return replace(explainer, likeness=None, budget=min(explainer.budget, 0.05))
     if isinstance(explainer, IntegratedGradients):
         return replace(explainer, max_steps=explainer.steps)
-    return replace(explainer, pairs=_FEW_PAIRS) if isinstance(explainer, Shapley) else explainer
+    return replace(explainer, pairs=100) if isinstance(explainer, Shapley) else explainer
 
 
 @dataclass(frozen=True, kw_only=True)

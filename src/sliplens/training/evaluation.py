@@ -181,9 +181,6 @@ def _r2(truth: Float[np.ndarray, " _"], predicted: Float[np.ndarray, " _"]) -> f
     return float(1 - np.sum((predicted - truth) ** 2) / spread) if spread > 0 else None
 
 
-_WITHHELD = 0.2  # share of the frames
-
-
 def risk_coverage(
     errors: Float[np.ndarray, " frames"], trust: dict[str, Float[np.ndarray, " frames"] | None]
 ) -> RiskCoverage:
@@ -196,7 +193,7 @@ def risk_coverage(
     ----------
     El-Yaniv and Wiener, *On the Foundations of Noise-free Selective Classification*, JMLR 2010.
     """
-    answered = max(1, round((1 - _WITHHELD) * len(errors)))
+    answered = max(1, round(0.8 * len(errors)))
     # stable: frames that are trusted alike are withheld in their order
     surest = {
         name: errors[np.argsort(-values, kind="stable")[:answered]]

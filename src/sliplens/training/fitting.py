@@ -57,8 +57,6 @@ _DIRECTION_TRIALS, _DIRECTION_FRAMES, _LEAST_DIRECTIONS = 40, 5, 3
 _PULLED, _SURE, _DIRECTION_MARGIN_DEG = 0.6, 5.0, 10.0
 """Margin below which a frame is pulled enough; length of a shear, in standard deviations, whose direction is known to
 11 degrees; and what a range is widened by at both ends, for that and for directions that no trial had."""
-_NOVELTY_FRAMES = 2000
-"""Largest number of frames that `Novelty` is fitted on."""
 
 
 def train(
@@ -378,7 +376,7 @@ def fit(
         model.load_state_dict(network.state_dict(), strict=False)
         last_layer(model).load_state_dict(last_layer(network).state_dict())
     model.eval()
-    samples = (some.sample(_NOVELTY_FRAMES, batch_size=config.batch_size) for some in (train, validation))
+    samples = (some.sample(2000, batch_size=config.batch_size) for some in (train, validation))
     complete = replace(
         manifest,
         trained_on=tuple(dict.fromkeys((*manifest.trained_on, *(start.manifest.trained_on if start else ())))),
@@ -391,7 +389,7 @@ def fit(
         novelty=learnt.novelty if learnt else fit_novelty(model, *samples),
     )
     save_checkpoint(folder, model, complete)
-    late = config.max_minutes is not None and module.step < module.steps
+    late = config.max_minutes is not None and module.global_step < module.steps
     epoch, train_mse, validation_mse, minutes = np.array(module.rows, dtype=np.float64).reshape(-1, 4).T
     training = Training(
         input=manifest.input,

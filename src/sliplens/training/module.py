@@ -49,7 +49,7 @@ class Regressor(lightning.LightningModule):
     ) -> None:
         super().__init__()
         self.model, self.config, self.augmentation = model, config, augmentation
-        self.steps, self.step, self.rows, self.metrics_file = steps, 0, list[list[float]](), metrics_file
+        self.steps, self.rows, self.metrics_file = steps, list[list[float]](), metrics_file
         limit = None if config.max_minutes is None else timedelta(minutes=config.max_minutes)
         self.timer = Timer(limit, verbose=False)
         """Clock, which also stops the training at its time limit; a resumed training has the time that is left."""
@@ -60,8 +60,8 @@ class Regressor(lightning.LightningModule):
 
     def fraction(self) -> float:
         """Share of the training that is done, in steps or in minutes, whichever is larger."""
-        limit = self.config.max_minutes
-        return min(1.0, max(self.step / self.steps, self.timer.time_elapsed("train") / 60 / limit if limit else 0.0))
+        limit, minutes = self.config.max_minutes, self.timer.time_elapsed("train") / 60
+        return min(1.0, max(self.global_step / self.steps, minutes / limit if limit else 0.0))
 
     def on_save_checkpoint(self, checkpoint: dict) -> None:
         """Keep the learning curve in a checkpoint."""
@@ -72,8 +72,7 @@ class Regressor(lightning.LightningModule):
         self.rows = checkpoint["rows"]
 
     def on_train_start(self) -> None:
-        """Restore the step of a checkpoint; from now on a request to end is an interruption."""
-        self.step = self.global_step
+        """Take a request to end for an interruption from now on."""
         if threading.current_thread() is threading.main_thread():
             # what was there before comes back when the training is over
             signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -119,7 +118,6 @@ class Regressor(lightning.LightningModule):
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Report the step."""
-        self.step = self.global_step
         report_progress(round(self.fraction() * self.steps), self.steps)
 
     def validation_step(self, batch: tuple[Tensor, Tensor, Tensor], batch_idx: int) -> None:
@@ -134,7 +132,7 @@ class Regressor(lightning.LightningModule):
 
     def on_train_epoch_end(self) -> None:
         """Add the epoch's row to the learning curve and write all of it as CSV; the validation has run by now."""
-        metrics, epoch = self.trainer.callback_metrics, self.step / self.steps * self.config.epochs
+        metrics, epoch = self.trainer.callback_metrics, self.global_step / self.steps * self.config.epochs
         errors = [metrics[name].item() for name in ("train_mse", "validation_mse")]
         if not math.isfinite(errors[1]):
             raise ModelError(
