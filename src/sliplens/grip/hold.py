@@ -165,7 +165,7 @@ class HoldLoop:
         controller: str | Controller,
         settings: Mapping[str, float] | None = None,
     ) -> None:
-        self._guard, self._readers = guard, readers
+        self._guard, self._readers, trouble = guard, readers, None
         self.steps: list[HoldStep] = []
         self.troubles: dict[str, None] = {}
         """Faults of the gripper, in the order in which they first came."""
