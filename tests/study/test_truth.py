@@ -310,7 +310,7 @@ def test_curves_under_the_true_fill_know_the_oracle(trained, explained, data, ma
     )
     rng = np.random.default_rng(0)
     noise = {f"noise {index}": rng.random(oracle.shape) for index in range(3)}
-    found = true_curves(trained, explained, data, maps={"oracle": oracle, **maps, **noise}, random_orders=4)
+    found = true_curves(trained, explained, {"oracle": oracle, **maps, **noise}, data=data, random_orders=4)
     np.testing.assert_array_equal(found["oracle"].areas, SHARES)
     for name in noise:
         assert np.all(found["oracle"].symmetric_gain > found[name].symmetric_gain)

@@ -5,7 +5,7 @@ import weakref
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import product
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -28,7 +28,7 @@ from sliplens.progress import OnProgress, add_note, number_of, open_stage, repor
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.results import study as results
 from sliplens.results.explanation import Explanation, Strip
-from sliplens.results.faithfulness import NEW_WEIGHTS, RemovalCurve
+from sliplens.results.faithfulness import NEW_WEIGHTS
 from sliplens.results.study import Study, StudyConfig
 from sliplens.runner import MakePart, Work, keep_record, require_executor
 from sliplens.simulation.trials import rebuild_trial
@@ -262,7 +262,6 @@ def estimate_minutes(records: Records) -> float:
 
 
 def _show_trial(records: Records) -> Strip:
-    """Explain the trial of the panels from stick to slip, with the first network."""
     data, config, network = records.data, records.config, next(iter(records.networks.values()))
     recording = data.load(data.find(next(frame.trial for frame in records["choice"].frames if frame.pictured)))
     method = RECOMMENDED_METHOD if RECOMMENDED_METHOD in config.methods else config.methods[0]
@@ -294,9 +293,7 @@ def _measure(records: Records) -> Any:
 
 
 def _remove(records: Records) -> Removal:
-    def put_back(part: Explanation, maps: Influence, seed: int) -> Mapping[str, RemovalCurve]:
-        return true_curves(records.run, part, records.data, maps=maps, random_orders=STUDY_ORDERS, seed=seed)
-
+    put_back = partial(true_curves, records.run, data=records.data, random_orders=STUDY_ORDERS)
     return Removal(
         trained=records.run,
         explained=records.explained,
@@ -363,11 +360,9 @@ class _StepWork(Work):
 
     @property
     def on_gpu(self) -> bool:
-        """True where the network runs on a graphics card."""
         return self.records.run.device.type != "cpu"
 
     def begin(self) -> MakePart:
-        """Open the step."""
         return STUDY[self.name].make(self.records).begin()
 
 

@@ -443,11 +443,11 @@ def _judge(
 def true_curves(
     trained: Network,
     explained: Explanation,
-    data: Dataset,
-    *,
     maps: Mapping[str, Maps],
-    random_orders: int = removal.RANDOM_ORDERS,
     seed: int = 0,
+    *,
+    data: Dataset,
+    random_orders: int,
 ) -> dict[str, RemovalCurve]:
     """Removal curves under the true fill: markers put back, most or least influential first, or in random orders."""
     frames = stage_frames(trained, explained, data)

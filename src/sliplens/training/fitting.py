@@ -163,7 +163,7 @@ def train(
             data_hash=data.hash,
             colour=has_colour(references[0]),
             channel_correlations=tuple(np.mean([channel_correlations(each) for each in references], axis=0).tolist()),
-            pull_direction_deg=trained_directions(config, data, trials[0], start),
+            pull_direction_deg=trained_directions(config, data, spread, start),
             trained_on=tuple(trial.sha256[:12] for some in trials for trial in some),
         )
         training = fit(config, train_frames, validation, folder, manifest, start=start, trainer=trainer, logger=opened)
@@ -234,8 +234,7 @@ def trained_directions(
     turned_deg = getattr(get_augmentation(config.augmentation), "rotation_deg", 0.0)
     if turned_deg >= 180:
         return FULL_CIRCLE
-    few = trials[:: max(1, -(-len(trials) // _DIRECTION_TRIALS))]
-    estimates = [pull_direction(data.load(info, truth=False)) for info in few]
+    estimates = [pull_direction(data.load(info, truth=False)) for info in trials]
     directions = [direction for direction in estimates if direction is not None]
     if len(directions) < _LEAST_DIRECTIONS:
         return None
