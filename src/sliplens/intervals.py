@@ -10,9 +10,6 @@ __all__ = ["FEWEST_UNITS", "Difference", "mean_interval", "paired_difference"]
 
 FEWEST_UNITS = 5
 """Fewer trials say little."""
-_FEWEST_DRAWN = 8
-"""From so many clusters on the distribution of t is drawn from them; that of fewer is Student's."""
-_RESAMPLES = 2000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +104,7 @@ def paired_difference(
     estimate = float(gap.mean())
     low_tail, high_tail = np.broadcast_to(0.025 / np.array(comparisons), 2)
     at = np.array([low_tail, 1 - high_tail])
-    many = len(free) == 1 and free[0].max() >= _FEWEST_DRAWN - 1
+    many = len(free) == 1 and len(np.unique(free[0])) >= 8  # enough to draw the distribution of t from
     ends = _drawn_ends(gap, free[0], at, rng) if many else _student_ends(gap, free, at)
     low, high = (None, None) if ends is None else (estimate + ends).tolist()
     return Difference(estimate=estimate, low=low, high=high, **over)
@@ -150,7 +147,7 @@ def _drawn_ends(
     """Ends of the interval, at these quantiles, less the estimate; clusters are drawn again."""
     sums, counts = np.bincount(level, weights=gap), np.bincount(level)
     # the clusters as they are, then drawn again
-    rows = np.concatenate([np.arange(len(sums))[None], rng.integers(0, len(sums), size=(_RESAMPLES, len(sums)))])
+    rows = np.concatenate([np.arange(len(sums))[None], rng.integers(0, len(sums), size=(2000, len(sums)))])
     sizes = counts[rows].sum(axis=1)
     means = sums[rows].sum(axis=1) / sizes
     rest = sums[rows] - means[:, None] * counts[rows]

@@ -227,20 +227,15 @@ def cascade(model: nn.Module, *, seed: int, stages: int, images: Images) -> Iter
             torch.manual_seed(1000 * seed + count - 1)
             module.reset_parameters()  # pyright: ignore[reportCallIssue]
         if count in ends:
-            _settle(changed, weighted[:count], images)
+            norms = [layer for layer in weighted[:count] if isinstance(layer, nn.modules.batchnorm._BatchNorm)]
+            momenta = [norm.momentum for norm in norms]
+            for norm in norms:
+                norm.reset_running_stats()
+                norm.momentum = None  # the statistics of this pass alone
+                norm.train()
+            with torch.no_grad():
+                changed(images)
+            for norm, momentum in zip(norms, momenta, strict=True):
+                norm.momentum = momentum
+                norm.eval()
             yield count, changed
-
-
-@torch.no_grad()
-def _settle(model: nn.Module, changed: list[nn.Module], images: Tensor) -> None:
-    """Give batch normalisation with new weights the statistics of some images."""
-    norms = [layer for layer in changed if isinstance(layer, nn.modules.batchnorm._BatchNorm)]
-    momenta = [norm.momentum for norm in norms]
-    for norm in norms:
-        norm.reset_running_stats()
-        norm.momentum = None  # the statistics of this pass alone
-        norm.train()
-    model(images)
-    for norm, momentum in zip(norms, momenta, strict=True):
-        norm.momentum = momentum
-        norm.eval()

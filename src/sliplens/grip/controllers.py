@@ -247,8 +247,7 @@ class SlipGate:
     slip.
     """
 
-    def __init__(self) -> None:
-        self._slipping: np.bool | Bool[np.ndarray, " contacts"] = np.bool(False)
+    _slipping: np.bool | Bool[np.ndarray, " contacts"] = np.bool(False)
 
     def update(
         self, slip: bool | Bool[np.ndarray, " contacts"], *, since_touch_s: Values, force_n: Values, earlier_n: Values

@@ -180,13 +180,6 @@ class Records:
         return self.networks[self.network]
 
     @cached_property
-    def _explainers(self) -> dict[str, Explainer]:
-        """Explainers by name; tiles stand for markers where the markers of some frame are unknown."""
-        explainers = choice.study_explainers(self.config.methods, budget=self.config.budget)
-        everywhere = all(frame.id in self["states"].markers for frame in self["choice"].frames)
-        return explainers if everywhere else choice.without_markers(explainers)
-
-    @cached_property
     def not_redrawn(self) -> str:
         """Reason why the chosen frames cannot be drawn again with markers put back; empty where they can."""
         if not self.data.simulated:
@@ -199,8 +192,12 @@ class Records:
 
     def explainers(self, frames: Sequence[str], images: Tensor) -> dict[str, Explainer]:
         """Explainers by name, with the markers of frames, whose network inputs are `images`."""
+        explainers = choice.study_explainers(self.config.methods, budget=self.config.budget)
         markers = self["states"].markers
-        return with_markers(self._explainers, images, lambda: choice.marker_places(self.run, frames, markers))
+        # tiles stand for markers where the markers of some frame are unknown
+        if any(frame.id not in markers for frame in self["choice"].frames):
+            explainers = choice.without_markers(explainers)
+        return with_markers(explainers, images, lambda: choice.marker_places(self.run, frames, markers))
 
     @cached_property
     def explained(self) -> Explanation:

@@ -375,7 +375,7 @@ class JudgingByTruth(Stage[Truth]):
             input=explained.input,
             source=explained.source,
             frames=len(frames),
-            methods=_judge(judged, frames, along, neutral, explained.clusters, seed=seed),
+            methods=self._judge(judged, frames, along, neutral),
             pairs=pairs,
             meta=meta_test(effects, interval),
             effects=MarkerEffects(
@@ -397,47 +397,44 @@ class JudgingByTruth(Stage[Truth]):
             ),
         )
 
-
-def _judge(
-    maps: Mapping[str, Maps],
-    frames: Sequence[StagedFrame],
-    effects: Sequence[Mapping[str, Float[np.ndarray, " values"]]],
-    neutral: Mapping[str, Float[np.ndarray, " frames"]],
-    clusters: Shaped[np.ndarray, "2 frames"],
-    *,
-    seed: int,
-) -> dict[str, Localisation]:
-    # frames in which nothing changes score no map; the others score all
-    valid = np.isfinite(neutral[CHANCE])
-    ranks, of_valid = {name: rows[valid] for name, rows in neutral.items()}, clusters[:, valid]
-    # a control has no sign: it gets the better one
-    controls = {
-        name: np.copysign(1.0, rows.mean()) * rows
-        for name, rows in ranks.items()
-        if is_control(name) and name != CHANCE and valid.any()
-    }
-    interval, records = partial(mean_of_defined, clusters=clusters, seed=seed, limits=(-1.0, 1.0)), {}
-    for name, values in maps.items():
-        means = marker_means(values, frames)
-        positive, lead = np.clip(values.astype(np.float64), 0, None), None
-        if not is_control(name) and name not in (ORACLE, DEGRADED) and valid.any():
-            rng = np.random.default_rng(seed)
-            lead = lead_over_controls(ranks[name], controls, clusters=of_valid, rng=rng)
-        records[name] = Localisation(
-            neutral=interval(neutral[name]),
-            lead_over_controls=lead,
-            edges=interval(
-                relevance_mass(rows, frame.edges) - frame.edges.mean()
-                for rows, frame in zip(positive, frames, strict=True)
-            ),
-            **{
-                truth: interval(
-                    rank_correlation(row, effect[truth]) for row, effect in zip(means, effects, strict=True)
-                )
-                for truth in _EFFECTS
-            },
-        )
-    return records
+    def _judge(
+        self,
+        maps: Mapping[str, Maps],
+        frames: Sequence[StagedFrame],
+        effects: Sequence[Mapping[str, Float[np.ndarray, " values"]]],
+        neutral: Mapping[str, Float[np.ndarray, " frames"]],
+    ) -> dict[str, Localisation]:
+        # frames in which nothing changes score no map; the others score all
+        valid = np.isfinite(neutral[CHANCE])
+        ranks, clusters = {name: rows[valid] for name, rows in neutral.items()}, self.explained.clusters
+        # a control has no sign: it gets the better one
+        controls = {
+            name: np.copysign(1.0, rows.mean()) * rows
+            for name, rows in ranks.items()
+            if is_control(name) and name != CHANCE and valid.any()
+        }
+        interval, records = partial(mean_of_defined, clusters=clusters, seed=self.seed, limits=(-1.0, 1.0)), {}
+        for name, values in maps.items():
+            means = marker_means(values, frames)
+            positive, lead = np.clip(values.astype(np.float64), 0, None), None
+            if not is_control(name) and name not in (ORACLE, DEGRADED) and valid.any():
+                rng = np.random.default_rng(self.seed)
+                lead = lead_over_controls(ranks[name], controls, clusters=clusters[:, valid], rng=rng)
+            records[name] = Localisation(
+                neutral=interval(neutral[name]),
+                lead_over_controls=lead,
+                edges=interval(
+                    relevance_mass(rows, frame.edges) - frame.edges.mean()
+                    for rows, frame in zip(positive, frames, strict=True)
+                ),
+                **{
+                    truth: interval(
+                        rank_correlation(row, effect[truth]) for row, effect in zip(means, effects, strict=True)
+                    )
+                    for truth in _EFFECTS
+                },
+            )
+        return records
 
 
 def true_curves(

@@ -3,7 +3,6 @@
 import math
 import os
 import tempfile
-from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -12,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, Float64, UInt8
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 from torch.utils.data import Dataset as TorchDataset
 from torch.utils.data import Sampler
@@ -20,7 +19,6 @@ from torchvision.transforms.v2 import functional as transforms
 
 from sliplens.errors import RecordingError
 from sliplens.extras import pick
-from sliplens.models.backbones import Answers, last_layer
 from sliplens.models.encodings import Encoding
 from sliplens.progress import report_each
 from sliplens.recordings import Dataset, Labels, TrialInfo
@@ -116,7 +114,7 @@ class FrameSet(TorchDataset):
 
     encoding: Encoding
     images: UInt8[Tensor, "frames colours size size"] | Float32[Tensor, "frames features"]
-    """Compared and resized frames, uint8, as `Encoding.resize` returns them; or features of `extract_features`."""
+    """Compared and resized frames, uint8, as `Encoding.resize` returns them; or inputs of the last layer."""
     safety_margin: Float32[Tensor, " frames"]
     """Labels in [0, 1]."""
     traction_ratio: Float32[Tensor, " frames"]
@@ -150,19 +148,6 @@ class FrameSet(TorchDataset):
         """Iterate over the inputs of a number of frames at most, spread over all trials."""
         rows = torch.linspace(0, len(self) - 1, min(len(self), count)).round().long()
         return (self.__getitems__(some)[0] for some in rows.split(batch_size))
-
-
-@torch.no_grad()
-def extract_features(model: nn.Module, frames: FrameSet, *, batch_size: int) -> FrameSet:
-    """Compute the input of the last linear layer of a network in evaluation mode, to train that layer alone."""
-    features, was_training = [], model.training
-    hook = last_layer(model).register_forward_pre_hook(lambda _, inputs: features.append(inputs[0].float().cpu()))
-    try:
-        deque(Answers(model.eval()).run(frames.batches(batch_size, report=True)), maxlen=0)
-    finally:
-        hook.remove()
-        model.train(was_training)
-    return replace(frames, images=torch.cat(features))
 
 
 def trial_friction(labels: Labels) -> float:

@@ -1,6 +1,7 @@
 """Training: fit a network to a data set."""
 
 import shutil
+from collections import deque
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
@@ -14,7 +15,7 @@ import torch
 from jaxtyping import Float
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import Logger
-from torch import nn
+from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from sliplens.codec import save_result
@@ -23,7 +24,7 @@ from sliplens.extras import pick, require_keywords
 from sliplens.files import output_folder, scratch_folder, versions
 from sliplens.images import channel_correlations, has_colour
 from sliplens.models import Manifest, Network, build_model, load, save_checkpoint
-from sliplens.models.backbones import HistogramRegressor, bin_edges, fill_head, last_layer
+from sliplens.models.backbones import Answers, HistogramRegressor, bin_edges, fill_head, last_layer
 from sliplens.models.calibration import Calibration, Traction, calibrate_histogram, conformal_calibration
 from sliplens.models.checkpoint import Estimate, Ratio, sensor_kind
 from sliplens.models.encodings import ENCODINGS, Encoding
@@ -38,7 +39,6 @@ from sliplens.training.config import RECIPES, TrainingChanges, TrainingConfig, m
 from sliplens.training.data import (
     EpochShuffle,
     FrameSet,
-    extract_features,
     get_augmentation,
     has_ratio,
     load_frames,
@@ -418,9 +418,15 @@ def _take_last_layer(
     network.load_state_dict(  # edges of a network of the package are rounded
         {name: model.get_buffer(name) for name in ("temperature", "edges", "ratio_edges")}, strict=False
     )
-    with open_stage("Passing frames through the network"):
-        train, validation = [extract_features(model, some, batch_size=batch_size) for some in report_each(frames)]
-    return network, (train, validation)
+    sets, features = [], list[Tensor]()
+    hook = last_layer(model).register_forward_pre_hook(lambda _, inputs: features.append(inputs[0].float().cpu()))
+    with open_stage("Passing frames through the network"), torch.no_grad():
+        for some in report_each(frames):
+            deque(Answers(model.eval()).run(some.batches(batch_size, report=True)), maxlen=0)
+            sets.append(replace(some, images=torch.cat(features)))
+            features.clear()
+    hook.remove()
+    return network, (sets[0], sets[1])
 
 
 def _begin(config: TrainingConfig, encoding: Encoding, start: Network | None) -> nn.Module:
