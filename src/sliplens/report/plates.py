@@ -249,7 +249,6 @@ def frames_by_margin(results: Study, explained: Explanation) -> list[int]:
     choice = results.choice
     chosen = [frame for frame in choice.frames if frame.pictured and frame.id in places] if choice else []
     if chosen:
-        chosen = [frame for frame in chosen if frame.trial == chosen[0].trial]
         return [places[frame.id] for frame in sorted(chosen, key=lambda frame: -frame.level)]
     conditions = [frame.condition for frame in explained.frames]
     most = max(sorted(set(conditions)), key=conditions.count)

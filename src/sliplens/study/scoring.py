@@ -38,7 +38,7 @@ from sliplens.results.study import REDRAWN, SETTINGS, MapMeasures, MapQuality, M
 from sliplens.runner import Part, keep_record
 from sliplens.study.choice import network_places, trial_seed
 from sliplens.study.explaining import Running
-from sliplens.study.stages import MakeRecord, Stage, TrialArrays, join_trials, mean_of_known, trial_parts
+from sliplens.study.stages import MakeRecord, Result, Stage, TrialArrays, join_trials, mean_of_known, trial_parts
 
 STEPS = 28
 """An eighth of the thesis's 224: the mean over the steps differs from that over all of them by less than a step."""
@@ -148,20 +148,17 @@ def score(
         random_orders=random_orders,
         seed=seed,
     )
-    stages: list[Stage] = [removal]
-    if steps:
-        stages.append(PixelDeletion(trained=network, explained=explanation, steps=steps, seed=seed))
+
+    def make_stage(stage: Stage[Result], folder: Path | None) -> Result:
+        with open_stage(stage.title):
+            return stage.make(folder and folder / type(stage).__name__, on=running.get("on", "serial"))
 
     def make(folder: Path | None) -> Faithfulness:
-        results = []
-        for stage in stages:
-            with open_stage(stage.title):
-                parts = folder and folder / type(stage).__name__
-                results.append(stage.make(parts, on=running.get("on", "serial")))
-        faithfulness, *deletions = results
-        for scores in deletions:
-            faithfulness = faithfulness.with_deletion(scores)
-        return faithfulness
+        scores = make_stage(removal, folder)
+        if not steps:
+            return scores
+        deletion = PixelDeletion(trained=network, explained=explanation, steps=steps, seed=seed)
+        return scores.with_deletion(make_stage(deletion, folder))
 
     with reporting(running.get("on_progress")):
         if out is None:

@@ -64,8 +64,7 @@ class TrainingConfig:
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
                 raise InputError(f"{name} must be {low:g} to {high:g}, got {value}")
-        if self.optimizer not in {"adamw", "ranger21"}:
-            raise InputError(f"there is no optimizer named {self.optimizer!r}; choose adamw or ranger21")
+        pick(dict.fromkeys(("adamw", "ranger21")), self.optimizer, noun="optimizer")
         wrong = self.head != "margin-and-ratio" or self.optimizer != "adamw" or self.augmentation != "none"
         if self.learns == "ratio" and (wrong or self.weight_decay):
             raise InputError("to learn F_t / F_n alone, leave out --head, --optimizer, --augmentation and weight_decay")

@@ -215,29 +215,21 @@ def lead_times(predictions: ScoredFrames) -> LeadTimes:
 
     A slip is the first frame of a trial with margin 0; what comes after is left out.
     """
-    names, time_s, labels = predictions.trial, predictions.time_s, predictions.safety_margin
     leads, slips, false, minutes = [], 0, 0, 0.0
-    for name in dict.fromkeys(names.tolist()):
-        rows = np.flatnonzero(names == name)
-        order = rows[np.argsort(time_s[rows], kind="stable")]
-        slipped = labels[order] <= 0
-        slips_at = int(np.argmax(slipped)) if slipped.any() else None
-        before = order if slips_at is None else order[:slips_at]
+    for trial in predictions.groups("trial").values():
+        frames = trial.where(np.argsort(trial.time_s, kind="stable"))
+        slip = np.flatnonzero(frames.safety_margin <= 0)[:1].tolist()
+        before = frames.where(np.arange(*slip or [len(frames)]))
         if not len(before):
             continue
-        alarms = predictions.prediction[before] < THRESHOLD
-        begins = np.flatnonzero(alarms & ~np.insert(alarms[:-1], 0, False))
-        is_false = labels[before][begins] > _FALSE_ABOVE * THRESHOLD
-        false += int(is_false.sum())
-        minutes += float(time_s[before[-1]] - time_s[before[0]]) / 60
-        if slips_at is None:
-            continue
-        slips += 1
-        slip_s = float(time_s[order[slips_at]])
+        alarms, high = before.prediction < THRESHOLD, before.safety_margin > _FALSE_ABOVE * THRESHOLD
+        begins = alarms & ~np.insert(alarms[:-1], 0, False)
+        false += int((begins & high).sum())
+        minutes += float(before.time_s[-1] - before.time_s[0]) / 60
+        slips += len(slip)
         # an alarm that began in vain and never ended is true from where the margin is low on
-        due = alarms & (labels[before] <= _FALSE_ABOVE * THRESHOLD)
-        if due.any():
-            leads.append(1e3 * (slip_s - float(time_s[before[np.argmax(due)]])))
+        due = np.flatnonzero(alarms & ~high)[:1]
+        leads += [1e3 * float(frames.time_s[at] - before.time_s[first]) for at in slip for first in due]
     return LeadTimes(
         trials=slips,
         warned=len(leads),

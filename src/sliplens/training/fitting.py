@@ -426,6 +426,7 @@ def _take_last_layer(
             sets.append(replace(some, images=torch.cat(features)))
             features.clear()
     hook.remove()
+    model.train()
     return network, (sets[0], sets[1])
 
 
