@@ -119,8 +119,7 @@ def test_a_marker_stands_halfway_and_scales_with_the_image(network: Network):
     x, y = np.meshgrid(np.arange(10, 100, 20.0), np.arange(10, 100, 20.0))
     rest = np.stack([x.ravel(), y.ravel()], axis=1)
     markers = marker_table(rest, rest + np.array([4.0, 0.0]))
-    manifest = replace(network.manifest, frame_size=(100, 100), image_size=50)
-    centres, reach = choosing.network_places(markers, manifest)
+    centres, reach = choosing.network_places(markers, replace(network.manifest, frame_size=(100, 100), image_size=50))
     np.testing.assert_allclose(centres, (rest + np.array([2.0, 0.0]) + 0.5) / 2 - 0.5)
     assert reach == pytest.approx(5.0)
 

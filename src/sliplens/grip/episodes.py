@@ -13,9 +13,9 @@ from typing import Literal, TypeAlias
 import numpy as np
 from jaxtyping import Bool
 
-from sliplens.codec import load_result, save_result
+from sliplens.codec import load_result
 from sliplens.errors import InputError
-from sliplens.files import DEFAULT_NETWORK, output_folder, to_builtins
+from sliplens.files import DEFAULT_NETWORK, to_builtins
 from sliplens.friction import Friction, FrictionLike, SlipLearner, as_friction
 from sliplens.grip.controllers import SPRINGS_BACK_S, Controller, Observation, SlipGate, make_controller
 from sliplens.grip.fingertip import FingertipReading, RenderedSensor, TableSensor, load_readings
@@ -37,7 +37,8 @@ from sliplens.grip.records import EpisodeTable, Grip, GripSetup, GripTrace
 from sliplens.live.slip import SlipBatch
 from sliplens.models import Network
 from sliplens.models.wrapping import open_run
-from sliplens.progress import OnProgress, number_of, open_stage, report_each, report_file, reporting
+from sliplens.progress import OnProgress, number_of, open_stage, report_each, reporting
+from sliplens.runner import keep_record
 
 _BATCH = 500  # episodes stepped together: few enough for a processor's caches
 _STILL_FRAMES = 30  # frames of the untouched fingertips before they close, for the noise of the markers
@@ -145,15 +146,9 @@ def run_episodes(
     with reporting(on_progress):
         if out is None:
             return run()
-        config = to_builtins(setup) | {"episodes": episodes}
-        with output_folder(Path(out), stage="grip", config=config, overwrite=overwrite) as output:
-            if output.complete:
-                grip = load_result(output.folder, Grip, command="sliplens grip")
-            else:
-                save_result(grip := run(), output.folder)
-        summary = f"{number_of(len(grip.episodes), 'episode')}, {100 * grip.drop_rate:.1f} % dropped"
-        report_file(Path(out), summary, kept=output.complete)
-    return grip
+        config, what = to_builtins(setup) | {"episodes": episodes}, number_of(episodes, "episode")
+        keep_record(Path(out), lambda _: run(), stage="grip", config=config, what=what, overwrite=overwrite)
+    return load_result(Path(out), Grip, command="sliplens grip")
 
 
 def _run(

@@ -191,14 +191,11 @@ def load_frames(
     """
     require_one_size(data, trials)
 
-    def copies_of(labelled: int) -> int:
-        return max(1, round(untouched_share * labelled)) if untouched_share > 0 else 0
-
-    counts = [int(data.read_labels(info).labelled.sum()) for info in trials]
-    if not sum(counts):
+    counts = np.array([data.read_labels(info).labelled.sum() for info in trials])
+    if not counts.sum():
         raise RecordingError(f"{data.folder}: no frame of the {len(trials)} trials has a label; label them first")
-    total = sum(count + copies_of(count) for count in counts)
-    shape = total, encoding.colours, image_size, image_size
+    untouched = (np.maximum(1, np.round(untouched_share * counts)) * (untouched_share > 0)).astype(int)
+    shape = int((counts + untouched).sum()), encoding.colours, image_size, image_size
     free_bytes = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else math.inf
     if scratch is None or math.prod(shape) <= free_bytes / 2:
         images = torch.empty(shape, dtype=torch.uint8)
@@ -207,10 +204,10 @@ def load_frames(
             file.truncate(math.prod(shape))
             images = torch.from_numpy(np.memmap(file, dtype=np.uint8, mode="r+", shape=shape))
     labels, ratios, frictions, times, rows = [], [], [], [], []
-    for info in report_each(trials):
+    for info, copies in report_each(list(zip(trials, untouched.tolist(), strict=True))):
         recording = data.load(info, truth=False)
         labelled = np.flatnonzero(recording.labelled)
-        copies, end = copies_of(len(labelled)), len(rows) + len(labelled)
+        end = len(rows) + len(labelled)
         compare = partial(encoding.compare_small, reference=recording.reference, image_size=image_size)
         images[len(rows) : end] = compare(recording.frames[labelled])
         if copies:
