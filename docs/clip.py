@@ -16,9 +16,9 @@ from PIL import Image
 import sliplens as sl
 from sliplens.files import DEFAULT_NETWORK
 from sliplens.plots.charts import column
-from sliplens.plots.saliency import full_colour, overlay_relevance
 from sliplens.plots.style import BLACK, BLUE, GREY, drawing_style
 from sliplens.recordings import Recording
+from sliplens.results.explanation import full_colour, overlay_relevance
 from sliplens.simulation import make_recipe, plan_trials, simulate_trial
 
 METHOD = "shapley-marker"

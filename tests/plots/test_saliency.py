@@ -7,9 +7,9 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 from sliplens.images import read_image
-from sliplens.plots.saliency import draw_explanation, full_colour, overlay_relevance
+from sliplens.plots.saliency import draw_explanation
 from sliplens.plots.style import ORANGE, SKY
-from sliplens.results.explanation import Explanation, MethodNotes
+from sliplens.results.explanation import Explanation, MethodNotes, full_colour, overlay_relevance
 
 
 def test_relevance_is_orange_below_zero_and_blue_above():

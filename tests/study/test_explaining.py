@@ -16,6 +16,7 @@ from sliplens.explainers.frames import FrameSelection
 from sliplens.explainers.occlusion import marker_regions, to_network_px
 from sliplens.explainers.table import RECOMMENDED_METHOD
 from sliplens.files import output_folder
+from sliplens.images import read_image
 from sliplens.models import Network
 from sliplens.recordings import Dataset, Recording
 from sliplens.recordings.options import ReadOptions
@@ -84,6 +85,8 @@ def test_an_interrupted_explanation_continues_after_the_last_map(explain_all: Ma
         explain_all(out=out, on_progress=interrupt)
     before = part_times(parts)
     assert len(before) == 3
+    overlays = [read_image(path) for path in (parts.parent / "overlays").rglob("*.png")]  # each whole, at once
+    assert len(overlays) == 3
     after: dict[str, int] = {}
     explain_all(out=out, on_progress=lambda *_: after.update(part_times(parts)))
     assert before.items() <= after.items()  # the three maps were not made again
@@ -98,7 +101,7 @@ def test_a_failure_after_the_last_map_loses_none(
 
     out = tmp_path / "maps"
     with monkeypatch.context() as patch:
-        patch.setattr("sliplens.study.explaining.draw_explanation", fail)
+        patch.setattr("sliplens.plots.saliency.draw_explanation", fail)
         with pytest.raises(OSError, match="no space left"):
             explain_all(method="grad-cam", out=out)
     monkeypatch.setattr("sliplens.explainers.cam.capture", fail)  # no map is made again

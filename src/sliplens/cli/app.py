@@ -1,8 +1,10 @@
 """Commands made of functions: options, defaults, types and help come from signature and docstring."""
 
 import ast
+import gc
 import inspect
 import re
+import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import cached_property, partial
@@ -91,8 +93,7 @@ class _Option(NamedTuple):
 
 def adapt(command: Command) -> tuple[Callable[..., object], list[str]]:
     """Return the function that cyclopts calls for a command, and the names of its options."""
-    module, _, name = command.function.partition(":")
-    function = getattr(import_module(module), name)
+    function = _load(command)
     hints = get_type_hints(function)
     for hint in [hint for hint in hints.values() if get_origin(hint) is Unpack]:
         hints |= get_type_hints(get_args(hint)[0])
@@ -124,6 +125,31 @@ def adapt(command: Command) -> tuple[Callable[..., object], list[str]]:
     call.__signature__ = Signature(parameters)  # pyright: ignore[reportFunctionMemberAccess]
     call.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return call, names
+
+
+def _load(command: Command) -> Callable[..., object]:
+    """Import the function of a command without what takes seconds and is of no use to a command."""
+    module, _, name = command.function.partition(":")
+    gc.disable()  # else it searches the imported objects, which stay, time and again
+    try:
+        function = getattr(import_module(module), name)
+    finally:
+        gc.enable()
+    if pyarrow := sys.modules.get("pyarrow"):
+        sys.meta_path.insert(0, _WithoutPandas)  # pyright: ignore[reportArgumentType]
+        pyarrow.array([])  # looks for pandas here and not again
+        sys.meta_path.remove(_WithoutPandas)  # pyright: ignore[reportArgumentType]
+    return function
+
+
+class _WithoutPandas:
+    """Finder of modules that finds no pandas."""
+
+    @staticmethod
+    def find_spec(name: str, *_: object) -> None:
+        """Refuse pandas; other finders look for any other module."""
+        if name == "pandas":
+            raise ImportError(name)
 
 
 def _options(kind: Any, command: Command, *, skip: int = 0, group: str = "") -> dict[str, _Option]:

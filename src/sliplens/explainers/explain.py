@@ -10,7 +10,7 @@ from typing import Annotated, TypeAlias
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
 from sliplens.errors import InputError, ModelError, SliplensError
@@ -174,10 +174,15 @@ def join_maps(
         methods={method: _notes(pieces, reasons, (*chosen.warnings, *warnings)) for method, pieces in maps.items()},
         images=chosen.images.numpy(),
         references=chosen.references.numpy(),
-        pictures=(255 * frame_of(normalised).permute(0, 2, 3, 1)).round().to(torch.uint8).contiguous().numpy(),
+        pictures=pictures_of(normalised),
         baseline=chosen.baseline,
         relevance={method: np.concatenate([piece.relevance for piece in pieces]) for method, pieces in maps.items()},
     )
+
+
+def pictures_of(inputs: Float[Tensor, "frames colours size size"]) -> UInt8[np.ndarray, "frames size size 3"]:
+    """Return the frames of network inputs in 8 bits, for viewing."""
+    return (255 * frame_of(inputs).permute(0, 2, 3, 1)).round().to(torch.uint8).contiguous().numpy()
 
 
 _MOST_NAMES = 3

@@ -10,7 +10,6 @@ from typing import Literal, TypeAlias, Unpack
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, UInt8
-from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from sliplens.errors import ImageError, InputError, RecordingError, SliplensError
@@ -155,6 +154,8 @@ def frames_from_arrays(
         network.require_frame_size(baseline.shape[:2], what="the baseline's frame")
         references, name = small(baseline[None]), "given"
     elif baseline == "blurred":
+        from scipy.ndimage import gaussian_filter  # noqa: PLC0415 (takes a fifth of a second)
+
         sigma = _BLUR_SHARE * frames.shape[1]
         blurred = gaussian_filter(frames.astype(np.float32), (0, sigma, sigma, 0))
         references, name = small(np.round(blurred).astype(np.uint8)), baseline

@@ -23,12 +23,11 @@ from sliplens.extras import require_keywords
 from sliplens.files import require_new_file
 from sliplens.live.reading import Reading
 from sliplens.live.sinks import RerunSink
-from sliplens.plots.saliency import full_colour, overlay_relevance
 from sliplens.plots.style import written_whole
 from sliplens.progress import OnProgress, open_stage, report_each, reporting
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.source import SourceOptions, open_source
-from sliplens.results.explanation import Explanation, load_explanation
+from sliplens.results.explanation import Explanation, full_colour, load_explanation, overlay_relevance
 
 _ARROWS = [(240, 228, 66)]
 _HALF_PX = 0.5  # a pixel's centre is a whole number here, and a half more in Rerun

@@ -15,9 +15,9 @@ from matplotlib.ticker import MaxNLocator
 
 from sliplens.explainers.table import EXPLAINERS
 from sliplens.plots import style
-from sliplens.plots.saliency import SIGN_COLOURS, full_colour, overlay_relevance
+from sliplens.plots.saliency import SIGN_COLOURS
 from sliplens.results.evaluation import BinScore, ScoredFrames, Training
-from sliplens.results.explanation import BASELINES, Strip
+from sliplens.results.explanation import BASELINES, Strip, full_colour, overlay_relevance
 from sliplens.results.faithfulness import CHANCE, DeletionCurve, RemovalCurve
 
 MARGIN_LABEL = "Safety margin Γ (%)"

@@ -20,11 +20,11 @@ from sliplens.files import DEFAULT_NETWORK, require_new_file
 from sliplens.intervals import Difference
 from sliplens.markers.gel import SensorProposal, propose_profile
 from sliplens.plots import charts, style
-from sliplens.plots.saliency import POINTS, SIGN_COLOURS, full_points, overlay_points
+from sliplens.plots.saliency import POINTS, SIGN_COLOURS
 from sliplens.plots.sheets import plot_margin
 from sliplens.recordings.sensor import save_profile
 from sliplens.recordings.source import Frames
-from sliplens.results.explanation import CLOSE, Explanation
+from sliplens.results.explanation import CLOSE, Explanation, full_points, overlay_points
 from sliplens.results.faithfulness import Faithfulness, is_control
 from sliplens.results.study import Study, Truth, UntrainedMaps
 

@@ -1,41 +1,21 @@
 """Signed maps over what the network saw."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import fill
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgb
+from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 
-from sliplens.images import write_png
 from sliplens.plots.style import ORANGE, SKY, drawing_style, method_name, percent, reading_words
-from sliplens.results.explanation import BASELINES, Explanation, full_colour
+from sliplens.results.explanation import BASELINES, DIM, Explanation, FrameU8, full_points, write_overlays
 
-FrameU8: TypeAlias = UInt8[np.ndarray, "height width 3"]
-"""A picture, RGB."""
-DIM = 0.55  # of the picture's lightness: leaves the bright end of the colours to the relevance
 SIGN_COLOURS = LinearSegmentedColormap.from_list("sign", [ORANGE, (DIM / 2,) * 3, SKY])
 """Colours of what lowers a prediction and of what raises it over a mid-grey picture, from -1 to 1."""
-
-
-def overlay_relevance(picture: FrameU8, share: Float[np.ndarray, "rows columns"]) -> FrameU8:
-    """Picture in dimmed grey under a signed map in [-1, 1]: orange lowers, blue raises, the stronger the less grey.
-
-    A map of another height and width than the picture's is repeated.
-    """
-    places = [np.arange(side) * count // side for side, count in zip(picture.shape, share.shape, strict=False)]
-    value = np.clip(share[np.ix_(*places)].astype(np.float64), -1, 1)[..., None]
-    colour = np.where(value < 0, to_rgb(ORANGE), to_rgb(SKY))
-    lightness = picture @ np.array([0.299, 0.587, 0.114]) / 255  # luma by ITU-R BT.601
-    mixed = (1 - np.abs(value)) * DIM * lightness[..., None] + np.abs(value) * colour
-    return np.round(255 * mixed).astype(np.uint8)
-
-
 POINTS = "points of margin per 1 % of the image"
 """Unit of maps in figures."""
 _BAR_WORDS = f"orange lowers the prediction, blue raises it\n(full colour beside each row, in {POINTS})"
@@ -44,24 +24,6 @@ _BAR_IN = 4.0  # as wide as the label of the colour bar
 _SHARP_PX = 256
 _WIDEST = 12
 """Frames of a panel at most, which can still be seen on a screen."""
-_LEAST = 0.2
-"""Least full colour, in points of margin per 1 % of the image: 2 points, which is nothing to explain, on a tenth."""
-
-
-def full_points(relevance: Float[np.ndarray, "frames height width"], *, scale: float = 1.0) -> float:
-    """Return the relevance that gets the full colour in all frames, in points of margin per 1 % of the image."""
-    return max(full_colour(relevance * relevance[0].size), _LEAST * scale)
-
-
-def overlay_points(
-    pictures: Iterable[FrameU8], relevance: Float[np.ndarray, "frames height width"], *, scale: float = 1.0
-) -> list[FrameU8]:
-    """Overlay pictures with signed maps on one scale (`full_points`)."""
-    limit = full_points(relevance, scale=scale)
-    return [
-        overlay_relevance(picture, values * values.size / limit)
-        for picture, values in zip(pictures, relevance, strict=True)
-    ]
 
 
 def draw_explanation(explanation: Explanation, folder: Path) -> None:
@@ -71,10 +33,8 @@ def draw_explanation(explanation: Explanation, folder: Path) -> None:
     per = 1 if explanation.unit == "margin" else 100
     rows = [PictureRow(name="Network input", pictures=[explanation.pictures[column] for column in columns])]
     for method, relevance in explanation.relevance.items():
-        (overlays := folder / "overlays" / method).mkdir(parents=True, exist_ok=True)
-        pictures = overlay_points(explanation.pictures, relevance, scale=explanation.scale)
-        for frame, picture in zip(explanation.frames, pictures, strict=True):
-            write_png(overlays / f"{frame.id}.png", picture)
+        overlays, names = folder / "overlays" / method, [frame.id for frame in explanation.frames]
+        pictures = write_overlays(overlays, names, explanation.pictures, relevance, scale=explanation.scale)
         full = full_points(relevance, scale=explanation.scale) / per
         rows.append(PictureRow(name=method_name(method), pictures=[pictures[at] for at in columns], full=full))
     titles = []

@@ -1,6 +1,6 @@
 """Explanations of frames by one or several methods, and a strip of one trial."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -11,7 +11,8 @@ from jaxtyping import Float, Float32, Float64, Shaped, UInt8
 
 from sliplens.codec import UNKNOWN, Columns, Result, load_record, load_result
 from sliplens.errors import InputError, SaliencyError
-from sliplens.files import RUN_FILE, Provenance, require_folder
+from sliplens.files import RUN_FILE, Provenance, require_folder, whole_file
+from sliplens.images import write_png
 from sliplens.progress import number_of
 from sliplens.results.evaluation import AMOUNT, ANSWER, MARGIN, TIME, OfOutput
 
@@ -28,6 +29,10 @@ BASELINES: dict[BaselineName, str] = {
     "blurred": "the blurred image",
 }
 """Baselines in words."""
+FrameU8: TypeAlias = UInt8[np.ndarray, "height width 3"]
+"""A picture, RGB."""
+DIM = 0.55  # of the picture's lightness: leaves the bright end of the colours to the relevance
+_LOWERS, _RAISES = np.array([[0xE6, 0x9F, 0x00], [0x56, 0xB4, 0xE9]]) / 255  # orange and sky blue of `plots.style`
 CLOSE = 0.02
 """Change of the prediction in margin units below which there is nothing to explain: a regressor's error is larger."""
 
@@ -173,6 +178,55 @@ def full_colour(relevance: Float[np.ndarray, "*any"]) -> float:
     sizes = np.abs(relevance)
     # a few outlying pixels would leave the rest of the map black
     return float(np.percentile(sizes, 99.5)) or float(sizes.max()) or 1.0
+
+
+def overlay_relevance(picture: FrameU8, share: Float[np.ndarray, "rows columns"]) -> FrameU8:
+    """Picture in dimmed grey under a signed map in [-1, 1]: orange lowers, blue raises, the stronger the less grey.
+
+    A map of another height and width than the picture's is repeated.
+    """
+    places = [np.arange(side) * count // side for side, count in zip(picture.shape, share.shape, strict=False)]
+    value = np.clip(share[np.ix_(*places)].astype(np.float64), -1, 1)[..., None]
+    colour = np.where(value < 0, _LOWERS, _RAISES)
+    lightness = picture @ np.array([0.299, 0.587, 0.114]) / 255  # luma by ITU-R BT.601
+    mixed = (1 - np.abs(value)) * DIM * lightness[..., None] + np.abs(value) * colour
+    return np.round(255 * mixed).astype(np.uint8)
+
+
+_LEAST = 0.2
+"""Least full colour, in points of margin per 1 % of the image: 2 points, which is nothing to explain, on a tenth."""
+
+
+def full_points(relevance: Float[np.ndarray, "frames height width"], *, scale: float = 1.0) -> float:
+    """Return the relevance that gets the full colour in all frames, in points of margin per 1 % of the image."""
+    return max(full_colour(relevance * relevance[0].size), _LEAST * scale)
+
+
+def overlay_points(
+    pictures: Iterable[FrameU8], relevance: Float[np.ndarray, "frames height width"], *, scale: float = 1.0
+) -> list[FrameU8]:
+    """Overlay pictures with signed maps on one scale (`full_points`)."""
+    limit = full_points(relevance, scale=scale)
+    return [
+        overlay_relevance(picture, values * values.size / limit)
+        for picture, values in zip(pictures, relevance, strict=True)
+    ]
+
+
+def write_overlays(
+    folder: Path,
+    names: Sequence[str],
+    pictures: Iterable[FrameU8],
+    relevance: Float[np.ndarray, "frames height width"],
+    *,
+    scale: float,
+) -> list[FrameU8]:
+    """Write an overlay of every map into a folder, whole or not at all, and return them."""
+    overlays = overlay_points(pictures, relevance, scale=scale)
+    for name, overlay in zip(names, overlays, strict=True):
+        with whole_file(folder / f"{name}.png") as part:
+            write_png(part, overlay)
+    return overlays
 
 
 def require_saliency(

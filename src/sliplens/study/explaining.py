@@ -13,22 +13,38 @@ from torch import nn
 from sliplens.errors import InputError, SliplensError
 from sliplens.explainers import frames as choosing
 from sliplens.explainers.contract import Explainer
-from sliplens.explainers.explain import MethodMaps, Methods, choose_explainers, explain_rows, join_maps, with_markers
+from sliplens.explainers.explain import (
+    MethodMaps,
+    Methods,
+    choose_explainers,
+    explain_rows,
+    join_maps,
+    pictures_of,
+    with_markers,
+)
 from sliplens.explainers.frames import MARGIN_LEVELS, Baseline, ChosenFrames, FrameSelection
 from sliplens.explainers.occlusion import marker_regions, markers_in_recording, to_network_px
 from sliplens.explainers.table import EXPLAINERS, RECOMMENDED_METHOD
 from sliplens.extras import require_keywords
+from sliplens.files import remove
 from sliplens.images import Images
 from sliplens.models import Network
 from sliplens.models.wrapping import Preprocess, open_run
-from sliplens.plots.saliency import draw_explanation
 from sliplens.progress import OnProgress, add_note, ignore, number_of, open_stage, reporting
 from sliplens.recordings import Dataset, Recording, load_dataset
 from sliplens.recordings.dataset import DATASET_FILE
 from sliplens.recordings.options import ReadOptions, option_flags
 from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.recordings.source import SourceOptions, open_source, read_reference
-from sliplens.results.explanation import BASELINES, Explanation, MovedMarkers, Strip, StripReadings, load_explanation
+from sliplens.results.explanation import (
+    BASELINES,
+    Explanation,
+    MovedMarkers,
+    Strip,
+    StripReadings,
+    load_explanation,
+    write_overlays,
+)
 from sliplens.runner import Part, keep_record, part
 from sliplens.simulation.trials import put_markers_back, rebuild_trial, visible_markers
 from sliplens.study.choice import marker_sums, study_explainers, without_markers
@@ -106,8 +122,9 @@ def explain(
     labels_in_names
         If True, names of images such as `image_433_20.png` hold the safety margin in percent.
     out
-        Folder to write: the record, overlays of every map, and a panel of them; nothing is written if None. An
-        interrupted call continues after its last map.
+        Folder to write: the record, overlays of every map, and a panel of them; nothing is written if None. Until it
+        is complete, each map appears in `.NAME.partial/overlays` beside it. An interrupted call continues after its
+        last map.
     running
         Options of `ExplainOptions`.
 
@@ -167,13 +184,17 @@ def explain(
         what = f"{maps} of {frames if len(chosen.ids) == 1 else f'each of {frames}'}, panel.png"
 
         def make(parts: Path) -> Explanation:
-            with open_stage(title):
-                explanation = work.make(parts, on=running.get("on", "serial"))
+            overlays = parts.parent / "overlays"
+            with open_stage(f"Explaining {frames} into {overlays}"):
+                explanation = replace(work, overlays=overlays).make(parts, on=running.get("on", "serial"))
                 notes = explanation.methods
                 # inside the stage: warnings that differ in numbers alone are then shown once
                 for warning in dict.fromkeys(text for each in notes.values() for text in each.warnings):
                     methods = [name for name, each in notes.items() if warning in each.warnings]
                     add_note(f"{', '.join(methods)}: {warning}")
+            from sliplens.plots.saliency import draw_explanation  # noqa: PLC0415 (the first map need not wait for it)
+
+            remove(overlays)  # of each map by itself; those of all have one scale
             draw_explanation(explanation, parts.parent)
             return explanation
 
@@ -237,16 +258,24 @@ class Explaining(Stage[Explanation]):
     chosen: ChosenFrames
     explainers: Mapping[str, Explainer]
     warnings: tuple[str, ...] = ()
+    overlays: Path | None = None
+    """Folder where each map is drawn as soon as it is made; None for nowhere."""
 
     def prepare(self) -> MakeRecord:
         """Return the function that explains a batch of frames with one method."""
-        maps = len(self.chosen.ids) * len(self.explainers)
+        network, chosen = self.trained, self.chosen
+        maps, normalise = len(chosen.ids) * len(self.explainers), network.encoding.normalise
 
         def explain_batch(item: tuple[str, int]) -> MethodMaps:
             method, batch = item
-            rows = self.chosen.batches[batch]
+            rows = chosen.batches[batch]
             with reporting(ignore):  # a whole part counts, not its passes
-                return explain_rows(self.trained, self.chosen, self.explainers[method], rows, maps=maps)
+                made = explain_rows(network, chosen, self.explainers[method], rows, maps=maps)
+            if self.overlays is not None:
+                names, pictures = [chosen.ids[row] for row in rows], pictures_of(normalise(chosen.images[list(rows)]))
+                scale = float(network.manifest.unit == "margin")  # that of another unit is not known yet
+                write_overlays(self.overlays / method, names, pictures, made.relevance, scale=scale)
+            return made
 
         return explain_batch
 
