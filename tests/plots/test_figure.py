@@ -9,7 +9,9 @@ from made_up import write_workspace
 
 import sliplens as sl
 from sliplens.errors import InputError
+from sliplens.live.reading import Reading
 from sliplens.models.predictions import Predictions
+from sliplens.recordings.check import Violation
 from sliplens.report import load_results
 from sliplens.results.evaluation import ScoredFrames
 from sliplens.results.explanation import Explanation
@@ -59,8 +61,33 @@ def test_a_prediction_that_is_that_of_the_baseline_has_nothing_to_explain(explan
 def test_what_is_not_there_and_what_has_no_picture_is_told(explanation):
     with pytest.raises(InputError, match="there is no number 2 among 2; count from 0"):
         sl.plot(explanation, index=2)
-    with pytest.raises(InputError, match="there is no picture of a SimpleNamespace; there is one of Evaluation"):
-        sl.plot(SimpleNamespace())
+    for nothing in (SimpleNamespace(), None, ["text"], {}, np.zeros(3)):
+        with pytest.raises(InputError, match=f"there is no picture of a {type(nothing).__name__}; plot a result"):
+            sl.plot(nothing)
+    with pytest.raises(InputError, match="nothing to draw"):
+        sl.plot(())  # a check without a fault
+
+
+def test_a_warning_of_other_frames_is_not_written_beneath_a_map(explanation):
+    warnings = tuple(f"1 of 2 frames ({frame.id}): the map {frame.id} is flat" for frame in explanation.frames)
+    notes = replace(explanation.methods["grad-cam"], warnings=warnings)
+    picture, _ = sl.plot(replace(explanation, methods={"grad-cam": notes}), index=1).axes
+    assert picture.get_xlabel().replace("\n", " ") == warnings[1]
+
+
+def test_records_in_a_list_are_counted_or_drawn_over_time():
+    faults = [Violation(where=trial, what=f"fault {number}") for number, trial in enumerate("aba")]
+    for counted in (faults, tuple(faults)):
+        ax = sl.plot(counted).axes[0]
+        assert {
+            label.get_text(): bar.get_width() for label, bar in zip(ax.get_yticklabels(), ax.patches, strict=True)
+        } == {
+            "a": 2,
+            "b": 1,
+        }
+    readings = [Reading(number=at, time_s=at / 30, captured_s=0.0, margin=1 - at / 10) for at in range(5)]
+    [line] = [line for line in sl.plot(readings).axes[0].lines if line.get_label() == "predicted"]
+    np.testing.assert_allclose(line.get_xydata(), [(at / 30, 100 - 10 * at) for at in range(5)])
 
 
 def test_predictions_of_any_trial_are_drawn(results):

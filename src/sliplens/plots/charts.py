@@ -55,7 +55,8 @@ def plot_margins(rows: pa.Table, *, ax: Axes, unit: str = "margin") -> Axes:
     low, high = ax.get_ylim()
     if of_margin:
         ax.set_ylim(min(low, -4), max(high, 104))
-    ax.legend(loc="lower left", bbox_to_anchor=(0.0, 0.99), ncols=2, borderaxespad=0.2)
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(loc="lower left", bbox_to_anchor=(0.0, 0.99), ncols=2, borderaxespad=0.2)
     if "trial" in rows.column_names:
         lines = -(-len(ax.get_legend_handles_labels()[0]) // 2)
         ax.set_title(rows["trial"][0].as_py(), parse_math=False, pad=6 + 15 * lines)

@@ -1,6 +1,9 @@
 """One figure for each kind of result, and one of a proposed sensor profile."""
 
-from collections.abc import Callable, Mapping
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping, Sized
+from dataclasses import is_dataclass
 from pathlib import Path
 from textwrap import fill as wrap
 from typing import Any
@@ -14,7 +17,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from sliplens.codec import COLUMN_KINDS, Columns, Result
+from sliplens.codec import COLUMN_KINDS, Columns, Result, table_rows
 from sliplens.errors import InputError
 from sliplens.files import DEFAULT_NETWORK, require_new_file
 from sliplens.intervals import Difference
@@ -33,15 +36,15 @@ def plot(result: Any, ax: Axes | None = None, *, index: int | None = None) -> Fi
     """Draw the main figure of a result.
 
     An evaluation shows predictions against labels; a training or a network its learning curve; an explanation the map
-    over the image, with its warnings; scores of explanations their curves or gains; predictions the margin over time;
-    tracked markers their displacement; a study the gain of each method with its 95 % interval; a grip the force over
-    the least that holds; a hold the commanded force. Margins are in percent, gains in margin units.
+    over the image, with its warnings; scores of explanations their curves or gains; predictions and readings the margin
+    over time; tracked markers their displacement; a study the gain of each method with its 95 % interval; a grip the
+    force over the least that holds; a hold the commanded force; a proposed sensor its gel and markers; a split or a
+    check how many trials or faults there are. Margins are in percent, gains in margin units.
 
     Parameters
     ----------
     result
-        Result of `evaluate`, `train`, `explain`, `score`, `predict`, `track` or `run_study`, or a record of
-        `sliplens.results`.
+        Result of a function of sliplens or a record of `sliplens.results`; or several in a list, as of `read_live`.
     ax
         Axes to draw on; a new figure if None.
     index
@@ -74,14 +77,20 @@ def plot(result: Any, ax: Axes | None = None, *, index: int | None = None) -> Fi
     '(points of margin per 1 % of the image)'
     """
     # by the names of the classes: some records live on higher floors, and drawing them needs no torch
-    drawer = next((DRAWERS[kind.__name__] for kind in type(result).__mro__ if kind.__name__ in DRAWERS), None)
-    drawer = drawer or (_rows if isinstance(result, Result | Columns) else None)
-    if drawer is None:
-        raise InputError(f"there is no picture of a {type(result).__name__}; there is one of {', '.join(DRAWERS)}")
+    name = next((kind.__name__ for kind in type(result).__mro__ if kind.__name__ in DRAWERS), "")
+    if isinstance(result, list | tuple) and all(map(is_dataclass, result)):
+        result = pa.Table.from_pylist(table_rows(result))
+    elif not name and not isinstance(result, Result | Columns):
+        raise InputError(
+            f"there is no picture of a {type(result).__name__}; plot a result, such as that of sl.predict or sl.explain"
+        )
     with style.drawing_style():
         figure = Figure(figsize=(6.4, 4.2), layout="constrained") if ax is None else ax.get_figure(root=True)
         assert figure is not None
-        drawer(result, figure.subplots() if ax is None else ax, index)
+        axes = figure.subplots() if ax is None else ax
+        DRAWERS.get(name, _rows)(result, axes, index)
+        if ax is None:  # room for the warnings of a map
+            figure.set_figheight(4.2 + 0.15 * axes.get_xlabel().count("\n"))
     return figure
 
 
@@ -106,9 +115,14 @@ def _explanation(explanation: Explanation, ax: Axes, index: int | None) -> None:
         near = style.amount(close, explanation.unit)
         why = f"{frame.id}: nothing to explain, for {predicted} is within {near} of that of {baseline}"
     ax.set_title(f"{style.method_name(method)}\n{wrap(why, 46)}", fontsize=9, parse_math=False)
-    ax.set_xlabel(
-        wrap("; ".join(explanation.methods[method].warnings), 62), fontsize=7.5, loc="left", color=style.VERMILLION
-    )
+    warnings = {text: _FRAMES_OF.match(text) for text in explanation.methods[method].warnings}
+    more = "\N{HORIZONTAL ELLIPSIS}"
+    texts = [text for text, match in warnings.items() if match is None or {frame.id, more} & {*match[1].split(", ")}]
+    ax.set_xlabel(wrap("; ".join(texts), 62), fontsize=7.5, loc="left", color=style.VERMILLION)
+
+
+_FRAMES_OF = re.compile(r"\d+ of \d+ frames? \((.*?)\): ")
+"""Beginning of a warning of some frames, with their names."""
 
 
 def _faithfulness(faithfulness: Faithfulness, ax: Axes, _: int | None) -> None:
@@ -142,22 +156,32 @@ def _untrained(record: UntrainedMaps, ax: Axes, index: int | None) -> None:
 
 
 def _rows(result: Any, ax: Axes, _: int | None) -> None:
-    """Draw the first number of each row of a table: a bar a row where they are few, else a line."""
-    table = result.to_arrow()
+    """Draw the first number of each row of a table: a bar a row where they are few, else a line.
+
+    Rows of texts alone are counted; those of readings are drawn over time.
+    """
+    table = result if isinstance(result, pa.Table) else result.to_arrow()
+    if "captured_s" in table.column_names:
+        names = {"margin": "prediction", "low": "low_90", "high": "high_90", "true_margin": "safety_margin"}
+        charts.plot_margins(table.rename_columns([names.get(name, name) for name in table.column_names]), ax=ax)
+        return
     kinds = dict(zip(table.column_names, table.schema.types, strict=True))
     numbers = [name for name, kind in kinds.items() if COLUMN_KINDS["numbers"](kind)]
-    if not (len(table) and numbers):
-        raise InputError(f"this {type(result).__name__} holds no number to draw")
-    name = next((name for name in numbers if name == "frames" or pa.types.is_floating(kinds[name])), numbers[0])
-    values, words = charts.column(table, name), name.replace("_", " ")
     texts = [table[each].to_pylist() for each, kind in kinds.items() if COLUMN_KINDS["texts"](kind)]
-    if len(table) > _MOST_BARS or not texts:
+    if not len(table) or not (numbers or (texts and isinstance(result, Sized))):
+        raise InputError("there is nothing to draw: this result holds no number, or is empty")
+    if numbers:
+        name = next((name for name in numbers if name == "frames" or pa.types.is_floating(kinds[name])), numbers[0])
+        values, words = charts.column(table, name), name.replace("_", " ")
+        labels = [f"{number}  {style.method_name(text)}" for number, text in enumerate(texts[0])] if texts else []
+    else:
+        counts = Counter(min(texts, key=lambda column: (len({*column}), len("".join(column)))))
+        labels, values, words = [*counts], np.array([*counts.values()]), "number of rows"
+    if len(values) > _MOST_BARS or not labels:
         ax.plot(values, color=style.BLUE)
         ax.set(xlabel="Row", ylabel=words)
         return
-    ax.barh(
-        [f"{number}  {style.method_name(texts[0][number])}" for number in range(len(table))], values, color=style.BLUE
-    )
+    ax.barh(labels, values, color=style.BLUE, height=0.6)
     ax.invert_yaxis()
     ax.set(xlabel=words)
 
@@ -211,7 +235,7 @@ def _of(count: int, index: int) -> int:
 
 def _network(network: Any, ax: Axes, _: int | None) -> None:
     if network.training is None:
-        raise InputError("this network has no record of its training, whose learning curve would be drawn")
+        raise InputError("this network has no record of its training; plot what sl.predict or sl.explain makes of it")
     charts.plot_learning_curves({network.training.input: network.training}, ax=ax)
 
 
@@ -235,33 +259,40 @@ DRAWERS: dict[str, Callable[[Any, Axes, int | None], object]] = {
     "Hold": lambda result, ax, _: charts.plot_grip_force(result.steps.to_arrow(), ax=ax).set_title(result.controller),
     "Recording": lambda result, ax, _: plot_margin(result, ax=ax).set_title(result.trial, parse_math=False),
     "Strip": lambda result, ax, _: charts.plot_readings(result, ax=ax),
+    "SensorProposal": lambda result, ax, _: _plot_proposal(result, ax=ax),
 }
 """Functions that draw a record, by the name of its class."""
 
 
 def write_proposal(proposal: SensorProposal, path: Path) -> None:
     """Save the camera's frame with gel, crop and markers beside the frame that the profile makes of it, as PNG."""
-    profile, frame, markers = proposal.profile, proposal.picture, proposal.markers_px
+    profile, frame = proposal.profile, proposal.picture
     with style.drawing_style(), style.written_whole(path) as part:
         figure = Figure(figsize=(9.6, 4.6), layout="constrained")
         camera, made = figure.subplots(1, 2, width_ratios=(frame.shape[1] / frame.shape[0], 1.0))
-        camera.imshow(frame)
-        crop = profile.crop_px or (0, 0, frame.shape[1], frame.shape[0])
-        for (x, y, *size), colour, words in ((proposal.gel_px, style.BLUE, "gel"), (crop, style.VERMILLION, "crop_px")):
-            box = {"fill": False, "color": colour, "linewidth": 1.6, "label": words}
-            camera.add_patch(Rectangle((x - 0.5, y - 0.5), *size, **box))
-        if len(markers):
-            words = f"{len(markers)} markers ({profile.markers})"
-            camera.plot(*markers.T, "o", mfc="none", mec="white", ms=9, label=words)
-        camera.set(title="camera", xlabel="x in pixels", ylabel="y in pixels")
-        below = {"bbox_to_anchor": (0.5, -0.16), "facecolor": "0.7"}  # rings are white
-        camera.legend(loc="upper center", ncols=3, frameon=True, **below)
+        _plot_proposal(proposal, ax=camera)
         made.imshow(profile.apply(frame))
         apart = f" (markers {proposal.spacing_px:.1f} apart)" if np.isfinite(proposal.spacing_px) else ""
         made.set(title=f"{profile.name}, after the profile", xlabel=f"x in pixels{apart}", ylabel="y in pixels")
-        for axes in (camera, made):
-            axes.grid(visible=False)
+        made.grid(visible=False)
         figure.savefig(part, dpi=120, format="png")
+
+
+def _plot_proposal(proposal: SensorProposal, *, ax: Axes) -> None:
+    """Draw the camera's frame with gel, crop and markers."""
+    frame, markers = proposal.picture, proposal.markers_px
+    ax.imshow(frame)
+    crop = proposal.profile.crop_px or (0, 0, frame.shape[1], frame.shape[0])
+    for (x, y, *size), colour, words in ((proposal.gel_px, style.BLUE, "gel"), (crop, style.VERMILLION, "crop_px")):
+        box = {"fill": False, "color": colour, "linewidth": 1.6, "label": words}
+        ax.add_patch(Rectangle((x - 0.5, y - 0.5), *size, **box))
+    if len(markers):
+        words = f"{len(markers)} markers ({proposal.profile.markers})"
+        ax.plot(*markers.T, "o", mfc="none", mec="white", ms=9, label=words)
+    ax.set(title="camera", xlabel="x in pixels", ylabel="y in pixels")
+    below = {"bbox_to_anchor": (0.5, -0.16), "facecolor": "0.7"}  # rings are white
+    ax.legend(loc="upper center", ncols=3, frameon=True, **below)
+    ax.grid(visible=False)
 
 
 def make_profile(

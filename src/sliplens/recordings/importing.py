@@ -533,4 +533,5 @@ def _assign(
         raise InputError(f"{validation} to validate and {test} to test are more than {len(captures)}; give fewer")
     if last != (None, None):
         splits = ["train"] * training + ["validation"] * validation + ["test"] * test
-    return SplitResult(splits=(*(info.split for info in old), *splits), notes=())
+    names = tuple(trial.trial for trial in (*old, *captures))
+    return SplitResult(trials=names, splits=(*(info.split for info in old), *splits), notes=())

@@ -10,6 +10,8 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Literal, TypeAlias, get_args
 
+import pyarrow as pa
+
 from sliplens.codec import Result
 from sliplens.errors import InputError, RecordingError
 from sliplens.files import MOST_TEXT, require_file
@@ -26,9 +28,17 @@ _MOST_NAMES = 5  # names in a message before the rest is counted
 class SplitResult(Result):
     """Split of every trial, and remarks on it."""
 
+    trials: tuple[str, ...]
     splits: tuple[str, ...]  #: In the order of the trials.
     notes: tuple[str, ...]
     """Sentences about rows without effect, splits without trials, objects or days in both train and test."""
+
+    def __len__(self) -> int:
+        return len(self.trials)
+
+    def to_arrow(self) -> pa.Table:
+        """Return a row for each trial: its name and its split."""
+        return pa.table({"trial": self.trials, "split": self.splits})
 
 
 def read_split_table(path: Path) -> dict[str, str]:
@@ -62,7 +72,7 @@ def assign_splits(trials: Sequence[TrialFacts], table: Mapping[str, str]) -> Spl
     splits = tuple(table[row] for row in rows)
     unused = [row for row in table if row not in rows]
     notes = [f"without effect in the table of splits: {_list(unused)}"] if unused else []
-    return SplitResult(splits=splits, notes=(*notes, *_remarks(trials, splits)))
+    return SplitResult(trials=tuple(names), splits=splits, notes=(*notes, *_remarks(trials, splits)))
 
 
 def split_by_group(
@@ -106,7 +116,7 @@ def split_by_group(
     split_of = dict(zip(groups, (split for split in counts for _ in range(counts[split])), strict=True))
     splits = tuple(split_of[group] for group in group_of)
     notes = [f"the {by} of {_list(unknown)} is unknown; split as one {by}"] if unknown else []
-    return SplitResult(splits=splits, notes=(*notes, *_remarks(trials, splits)))
+    return SplitResult(trials=tuple(names), splits=splits, notes=(*notes, *_remarks(trials, splits)))
 
 
 def load_splits(splits: Mapping[str, str] | Path | str) -> Mapping[str, str] | Group:
