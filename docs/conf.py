@@ -135,10 +135,29 @@ def write_math(translator: HTML5Translator, node: nodes.math | nodes.math_block)
     raise nodes.SkipNode
 
 
+def load_algorithms() -> dict[str, str]:
+    """Command and algorithm of each call as reStructuredText, from the tables of docs/api.md, for docs/api/calls.md."""
+    text, facts = (Path(__file__).parent / "api.md").read_text(encoding="utf-8"), {}
+    for name, row in re.findall(r"^\| \{py:\w+\}`~(sliplens\.\w+)` \|(.*)\|$", text, flags=re.MULTILINE):
+        command, _, purpose = (cell.strip(" `") for cell in row.split("|"))
+        algorithm = re.sub(r"\$(.+?)\$", r":math:`\1`", purpose.rpartition(": ")[2]).replace("{cite}", ":cite:")
+        algorithm = re.sub(r"\[(.+?)\]\((\w+)\.md(.*?)\)", r"`\1 <../\2.html\3>`__", algorithm)
+        facts[name] = f"Command: ``sliplens {command}``. " if command else ""
+        if ": " in purpose:
+            facts[name] += f"Algorithm: {algorithm}."
+    return facts
+
+
+ALGORITHMS = load_algorithms()
+
+
 def complete_docstring(_app: Sphinx, what: str, name: str, thing: object, _options: object, lines: list[str]) -> None:
-    """Add the name of a module, what it exports, and the pages of the gallery that use a name."""
+    """Add command and algorithm of a call, exports of a module, and the pages of the gallery that use a name."""
     # bars are absolute values, |T_n - T_0|, not substitutions of reStructuredText
     lines[:] = [re.sub(r"docs/(\w+)\.md", r":doc:`/\1`", line.replace("|", r"\|")) for line in lines]
+    if algorithm := ALGORITHMS.get(name):
+        summary = lines.index("") if "" in lines else len(lines)
+        lines[summary:summary] = ["", algorithm]
     if what == "module" and isinstance(thing, ModuleType):
         names = [
             one

@@ -3,7 +3,8 @@ Maps of one frame by several methods
 ====================================
 
 Compute maps of one frame by several methods. Each map explains the difference of the predicted margin from that of the
-untouched sensor. Maps are signed and in margin units: orange lowers the margin, blue raises it.
+untouched sensor. Maps are signed and in margin units: orange lowers the margin, blue raises it. They disagree:
+:doc:`plot_2_maps_against_redrawn_scenes` tests them.
 """
 
 import matplotlib.pyplot as plt
@@ -43,11 +44,8 @@ for ax, (method, explanation) in zip(axes.flat, maps.items(), strict=True):
 plt.show()
 
 # %%
-# The maps disagree. Each explanation has its warnings:
+# Each explanation has its warnings:
 for method, explanation in maps.items():
     for notes in explanation.methods.values():
         for warning in notes.warnings:
             print(f"{method}: {warning}")
-
-# %%
-# :doc:`plot_2_maps_against_redrawn_scenes` tests maps without using any map.

@@ -41,11 +41,11 @@ class Midpoint(Method):
 
 
 frame = trial.frames[24:25]
-own = sl.explain("chromatouch-difference", frame, reference=trial.reference, method=Midpoint())
-known = sl.explain("chromatouch-difference", frame, reference=trial.reference, method="integrated-gradients")
+midpoint = sl.explain("chromatouch-difference", frame, reference=trial.reference, method=Midpoint())
+integrated = sl.explain("chromatouch-difference", frame, reference=trial.reference, method="integrated-gradients")
 
 figure, axes = plt.subplots(ncols=2, figsize=(8, 4.4), layout="compressed")
-for ax, explanation in zip(axes, (own, known), strict=True):
+for ax, explanation in zip(axes, (midpoint, integrated), strict=True):
     sl.plot(explanation, ax)
     ax.set_title(explanation.method, loc="left")
 plt.show()

@@ -2,8 +2,8 @@
 Explain and test my own regressor
 =================================
 
-Explain any PyTorch module with one output an image, and test whether its maps can be trusted. The example is not about
-touch: the network estimates the slant of a handwritten digit.
+Explain any PyTorch module with one output an image: signed maps in the unit of the output. A score then tests whether
+the maps can be trusted. The example is not about touch: the network estimates the slant of a handwritten digit.
 """
 
 import matplotlib.pyplot as plt
@@ -57,11 +57,11 @@ predicted = sl.predict(network, frames[test]).frame()["prediction"].to_numpy()
 r2 = 1 - np.mean((predicted - slant[test]) ** 2) / slant[test].var()
 print(f"R2 on {len(test)} digits that were not trained on: {r2:.2f}")
 
-shown = test[np.argsort(slant[test])[[0, 1, 2, 3, 4, 5, -6, -5, -4, -3, -2, -1]]]
+extremes = test[np.argsort(slant[test])[[0, 1, 2, 3, 4, 5, -6, -5, -4, -3, -2, -1]]]
 methods = (get_explainer("integrated-gradients"), get_explainer("occlusion", tile_px=4))
-maps = sl.explain(network, frames[shown], method=methods)
+maps = sl.explain(network, frames[extremes], method=methods)
 figure, axes = plt.subplots(ncols=2, figsize=(10, 4), layout="constrained")
-for ax, index in zip(axes, (0, len(shown) - 1), strict=True):
+for ax, index in zip(axes, (0, len(extremes) - 1), strict=True):
     sl.plot(maps, ax, index=index)
 plt.show()
 
@@ -71,11 +71,11 @@ plt.show()
 # The score removes the pixels that a map ranks highest, then those it ranks lowest, and compares the changes of the
 # prediction. Random orders and controls, which use nothing the network learned, are scored as well. A map of another
 # library goes in as an array: here DeepLift of Captum.
-baseline = torch.zeros_like(images[shown])
-deep_lift = DeepLift(module).attribute(images[shown].requires_grad_(), baselines=baseline).sum(dim=1)
+baseline = torch.zeros_like(images[extremes])
+deep_lift = DeepLift(module).attribute(images[extremes].requires_grad_(), baselines=baseline).sum(dim=1)
 scores = {
     "ours": sl.score(network, maps),
-    "DeepLift": sl.score(network, frames[shown], deep_lift.detach().numpy()),
+    "DeepLift": sl.score(network, frames[extremes], deep_lift.detach().numpy()),
 }
 for name, score in scores.items():
     print(name, score)

@@ -3,7 +3,7 @@ Train a network for your sensor
 ===============================
 
 A network that was trained on another sensor is often wrong on yours. Ten labelled trials and some minutes adapt it.
-Here three epochs on small images show the steps within a minute.
+Here three epochs on small images show the steps within a minute; their accuracy is not that of a whole training.
 """
 
 import matplotlib.pyplot as plt
@@ -17,7 +17,7 @@ import sliplens as sl
 # several days: the last day is the test, the one before it validates. This simulated sensor is a flat gel with three
 # lights.
 data = sl.simulate(sensor="flat-gel", dry_trials=12, wet_trials=2, days=4, frames_per_trial=24)
-print(f"{len(data.trials)} trials of {len({one.day for one in data.trials})} days")
+print(f"{len(data.trials)} trials of {len({trial.day for trial in data.trials})} days")
 
 # %%
 # Measure the included network first

@@ -2,7 +2,8 @@
 Predict live, and control a grip
 ================================
 
-Predict the margin of a running camera, and control a grip force with it.
+Predict the margin of a running camera, and control a grip force with it. Camera and gripper are simulated here; neither
+was tested on a real fingertip or robot.
 """
 
 from pathlib import Path
@@ -21,9 +22,9 @@ import sliplens as sl
 folder = Path(mkdtemp()) / "replayed"
 sl.simulate(folder, dry_trials=4, wet_trials=1, days=4, frames_per_trial=120)
 readings = list(sl.read_live(folder, "chromatouch-pair", seconds=9.0))
-shown = [reading for reading in readings if reading.margin is not None]
-latency_ms = np.median([reading.latency.total_ms for reading in shown])
-print(f"{len(readings)} readings, {len(shown)} with a margin, {latency_ms:.0f} ms from frame to margin (median)")
+predicted = [reading for reading in readings if reading.margin is not None]
+latency_ms = np.median([reading.latency.total_ms for reading in predicted])
+print(f"{len(readings)} readings, {len(predicted)} with a margin, {latency_ms:.0f} ms from frame to margin (median)")
 
 # %%
 # A reading without a margin has a reason:
@@ -32,11 +33,11 @@ for reason in dict.fromkeys(reading.withheld for reading in readings if reading.
 
 # %%
 figure, ax = plt.subplots(figsize=(9, 3.8), layout="constrained")
-time_s = [reading.time_s for reading in shown]
-low, high = (np.multiply(100, [getattr(one, end) for one in shown]) for end in ("low", "high"))
+time_s = [reading.time_s for reading in predicted]
+low, high = (np.multiply(100, [getattr(reading, end) for reading in predicted]) for end in ("low", "high"))
 ax.fill_between(time_s, low, high, color="#0072B2", alpha=0.2, label="90 % interval")
-ax.plot(time_s, [100 * reading.margin for reading in shown], ".-", color="#0072B2", label="predicted")
-truth = [(one.time_s, 100 * one.true_margin) for one in readings if one.true_margin is not None]
+ax.plot(time_s, [100 * reading.margin for reading in predicted], ".-", color="#0072B2", label="predicted")
+truth = [(reading.time_s, 100 * reading.true_margin) for reading in readings if reading.true_margin is not None]
 ax.plot(*zip(*truth, strict=True), "k--", label="true")
 ax.set(xlabel="Time (s)", ylabel="Safety margin (%)", ylim=(-2, 102))
 ax.legend(loc="lower left")

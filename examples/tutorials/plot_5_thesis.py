@@ -3,8 +3,9 @@ Reproduce the thesis
 ====================
 
 Repeat the thesis: two networks trained on raw and on difference images, their accuracy on later days, the maps of the
-thesis and the recommended one, and Table 2. The whole study is one command and takes twenty minutes:
-``sliplens study DATA thesis-difference thesis-raw -o STUDY``. This page uses a few frames.
+thesis and the recommended one, and Table 2. This page uses a few frames, which only show the steps; :doc:`/study` has
+the results. The whole study is one command, about twenty minutes on two cores:
+``sliplens study DATA --network thesis-difference thesis-raw -o STUDY --on processes=2``.
 """
 
 import csv

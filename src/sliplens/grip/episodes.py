@@ -65,7 +65,7 @@ def run_episodes(
 
     Each episode lasts 6 s: the fingers close, lift from 0.5 s on, and hold while something happens. Rendered, both
     fingertips are drawn, predicted by the network and their markers followed, 60 times a second; otherwise predictions
-    are looked up in the network's measured errors on such images, dozens of episodes a second. Those of a network that
+    come from a table of the network's errors on such images, dozens of episodes a second. Those of a network that
     does not come with sliplens are measured first (minutes).
 
     Parameters

@@ -262,7 +262,7 @@ class HoldLoop:
 def _require_fit(controller: Controller, readers: Sequence[LiveReader]) -> None:
     """Refuse readers that cannot hold together, and a controller that needs more than they provide."""
     if len(readers) not in {1, 2}:
-        raise InputError(f"a gripper has one or two fingertips that are read, got {len(readers)}")
+        raise InputError(f"a gripper has one or two readers, got {len(readers)}")
     if isinstance(controller, AssumedFriction):
         raise InputError("this controller needs a force sensor at the wrist; choose margin, reflex or fixed")
     for reader in readers:

@@ -118,7 +118,7 @@ class ReaderSettings(TypedDict, total=False):
     """Coefficient of friction, as `predict` takes it, for a network that predicts F_t / F_n. A slip that the markers
     show narrows a range, until the object is let go; `Reading.friction` states the value used."""
     same_object: bool
-    """If True, every grasp is of one object, until `new_object`: the friction that a slip taught counts in later
+    """If True, every grasp is of one object, until `new_object`: the friction estimated from a slip counts in later
     grasps."""
     engine: str
     """`torch`, `openvino`, or `auto`, the default, for the fastest that pays for `seconds`, or for hours without it."""
@@ -142,7 +142,7 @@ LiveInput: TypeAlias = "str | Path | Images | Capture | LiveSource"
 
 
 class LiveReader:
-    """Readings of a running sensor; a context manager that captures and reads while it is entered.
+    """Readings of a running sensor; a context manager that captures and predicts while it is entered.
 
     One thread captures and one reads, with a place for the newest frame only between them: a network that is slower
     than the camera drops frames, counts them, and never lags behind. While it is entered, NumPy's matrices and OpenCV
@@ -272,7 +272,7 @@ class LiveReader:
     def require_entered(self) -> None:
         """Refuse a reader that was never entered."""
         if not self._threads:
-            raise InputError("nothing is read yet; enter the reader first, with `with reader:`")
+            raise InputError("there is no reading yet; enter the reader first, with `with reader:`")
 
     def __enter__(self) -> "LiveReader":
         if self._threads:

@@ -113,7 +113,7 @@ class MarkerReading:
     """Share of its largest value that the mean shear has lost, from 0 to 1, of a grasp that begins pressed."""
 
 
-NO_NETWORK = "no network, so no margin is read; name one with --network"
+NO_NETWORK = "no network, so no margin is predicted; name one with --network"
 """Advice where there is no network."""
 
 

@@ -40,7 +40,7 @@ class SlipEvaluation(Result):
 
     scores: SlipScores
     detected: Flags
-    """True for clips in which a frame up to the decision was read as slip."""
+    """True for clips in which a frame up to the decision was classified as slip."""
     fall: Float[np.ndarray, " clips"]
     """Largest fall of the mean shear, as a share; 0 where no shear was seen."""
     displacement_px: Float[np.ndarray, " clips"]
@@ -50,7 +50,7 @@ class SlipEvaluation(Result):
 def evaluate_slip(table: Path | str, *, after: int | None = None, markers: str = "auto") -> SlipEvaluation:
     """Evaluate slip detection on clips with labels.
 
-    Each clip is read from its first frame, or its `start_frame`, as a grasp that is pressed already: no untouched frame
+    Each clip counts from its first frame, or its `start_frame`, as a grasp that is pressed already: no untouched frame
     is needed. Baselines that need a threshold get it from the clips of all other objects.
 
     Parameters

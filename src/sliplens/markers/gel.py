@@ -99,7 +99,7 @@ def propose_profile(
         gel = left, top, right - left, bottom - top
         notes.append(f"{len(places)} markers of kind {kind}, {spacing:.1f} pixels apart")
     else:
-        notes.append("no markers were found; set their kind in `markers` if there are any")
+        notes.append("no markers were detected; set their kind in `markers` if there are any")
     crop = gel if size_px is None else _shaped(gel, size_px, (width, height))
     factor = 1.0 if size_px is None else size_px[0] / crop[2]
     notes += [

@@ -167,7 +167,7 @@ def predict(
         for difference images, compared before.
     friction
         Coefficient of friction of the object, for a network that predicts F_t / F_n: a number, (low, high), or a
-        `Friction`, such as one learnt from slips (docs/networks.md). If None, any friction of the training is possible.
+        `Friction`, as estimated from slips (docs/networks.md). If None, any friction of the training is possible.
     engine
         `torch`, `openvino`, or `auto` for OpenVINO where it is installed and the frames are many.
     batch_size

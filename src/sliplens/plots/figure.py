@@ -306,7 +306,7 @@ def make_profile(
 ) -> SensorProposal:
     """Make the profile of a sensor from a recording, and draw a picture of it beside the file.
 
-    Finds the gel's rectangle and the markers. Check the picture, and correct the file where it is wrong.
+    Detects the gel's rectangle and the markers. Check the picture, and correct the file where it is wrong.
 
     Parameters
     ----------

@@ -48,7 +48,7 @@ def check_dataset(
     data
         Data set, or its folder.
     against
-        Data set whose trials must be others, as those of a test. Trials are known by their frames, simulated ones by
+        Data set whose trials must be others, as those of a test. Trials are compared by frames, simulated ones by
         their seeds too. Days and sensors of both are notes.
 
     See Also

@@ -140,7 +140,7 @@ class Dataset(Result):
 
 
 def load_dataset(folder: Dataset | Path | str) -> Dataset:
-    """Open a data set that `import_recordings` or `simulate` made; trials are read on request.
+    """Open a data set that `import_recordings` or `simulate` made; trials are loaded on request.
 
     A recording that was cut off is noted, and no trial of the data set until `recover_dataset` finishes it. An open
     data set is returned as it is.

@@ -111,7 +111,7 @@ def explain(
         stick frame is found, the untouched sensor takes its place, with a warning.
     method
         Name of a method (docs/explainers.md), an explainer such as `get_explainer("occlusion", tile_px=8)`, or several
-        of them. If None, Shapley values of the markers, or of tiles where no markers are found.
+        of them. If None, Shapley values of the markers, or of tiles where no markers are detected.
     budget
         Share of the channels that `poly-cam` measures at first; below 1 it is faster. If None, 1 for one frame and 0.15
         for several.

@@ -66,7 +66,7 @@ def score(
     out: Path | str | None = None,
     **running: Unpack[Running],
 ) -> Faithfulness:
-    """Score maps by removing what they call influential first, and last, against random orders and controls.
+    """Score maps by removing the most influential pixels first, and last, against random orders and controls.
 
     The score is the symmetric gain, in margin units: how much further the prediction moves towards that of the
     baseline with the most influential parts removed first rather than the least. Maps that gain no more than

@@ -88,7 +88,7 @@ def train(
     recipe
         `default`, `thesis`, `ratio` or `adapt`.
     start_from
-        Network whose weights to start from, its folder, or the name of one that comes with sliplens: to teach it
+        Network whose weights to start from, its folder, or the name of one that comes with sliplens: to adapt it to
         another sensor, or to go on at another image size. It keeps its input, backbone and head.
     condition
         Train and validate on the trials of one condition alone, such as dry.

@@ -186,7 +186,7 @@ def read_stills(path: Path, options: ReadOptions) -> list[Capture]:
         if np.isnan(margin).all():
             raise RecordingError(f"{states} holds no safety margin; give one a line")
         require_possible(margin, name="safety_margin", where=states.name)
-        notes += (f"{states.name}: margins were read as {'percent' if percent else 'fractions'}, by their size.", *more)
+        notes += (f"{states.name}: margins are taken as {'percent' if percent else 'fractions'}, by their size.", *more)
     else:
         names, how = tables.choose_force_columns(table, options)
         numbers, lines, more = tables.read_numbers(table, names)

@@ -427,7 +427,7 @@ def read_numbers(
     if commas and points:
         raise RecordingError(f"{table.path} mixes decimal commas and points; write all numbers in one way")
     numbers = np.frombuffer(values, dtype=np.float64).reshape(-1, len(places))
-    return numbers, lines, (f"{table.path.name}: commas were read as decimal points.",) if commas else ()
+    return numbers, lines, (f"{table.path.name}: commas are decimal points.",) if commas else ()
 
 
 def place_on_clock(
