@@ -66,7 +66,7 @@ def find_appearance(frame: UInt8[np.ndarray, "height width 3"], kind: MarkerKind
     tries = [look for contrast in kind.contrasts if (look := _find_spots(frame, kind, contrast))]
     if not tries:
         raise ImageError(
-            f"fewer than {FEWEST} markers are detected in a frame of {frame.shape[0]} x {frame.shape[1]} pixels; choose "
+            f"fewer than {FEWEST} markers are visible in a frame of {frame.shape[0]} x {frame.shape[1]} pixels; choose "
             "another kind of markers, or use a frame that shows them"
         )
     return max(tries, key=lambda look: look[0])[1]
