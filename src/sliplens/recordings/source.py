@@ -267,5 +267,6 @@ def _with_reference(trial: Capture, image: Path | str | Images | None, number: i
     pixels = read_reference(image)
     if pixels.shape[:2] != trial.frame_size:
         sizes = [" x ".join(map(str, size)) for size in (pixels.shape[:2], trial.frame_size)]
-        raise ImageError(f"the reference is {sizes[0]} pixels, {trial.trial} is {sizes[1]}; record both alike")
+        mixed = f"the reference is {sizes[0]} pixels but the frames of {trial.trial} are {sizes[1]}"
+        raise ImageError(f"{mixed}; record both alike")
     return replace(trial, reference=pixels)
