@@ -198,13 +198,11 @@ CLOCK_S = (-1e6, 1e10)
 """Range of plausible times: seconds since the start of a recording or since 1970; others are in another unit."""
 _STEPS_S = (1e-6, 86400.0)  # least median and largest step of time of a camera or a force sensor
 MOST_FORCE_N = 1e4  #: Largest force on a fingertip, in newtons; a larger number is in another unit.
-_FORCES = (-MOST_FORCE_N, MOST_FORCE_N, "give it in newtons")
-_FRACTION = (0.0, 1.0, "give it as a fraction, not in percent")
 LABEL_BOUNDS = {
-    **dict.fromkeys(("normal_force_n", "tangential_force_n"), _FORCES),
+    **dict.fromkeys(("normal_force_n", "tangential_force_n"), (-MOST_FORCE_N, MOST_FORCE_N, "give it in newtons")),
     # after the slip it is F_t / F_n, which is large where hardly anything presses
     "friction_coefficient": (-MOST_FORCE_N, MOST_FORCE_N, "make the labels again"),
-    **dict.fromkeys(("safety_margin", "stick_ratio"), _FRACTION),
+    **dict.fromkeys(("safety_margin", "stick_ratio"), (0.0, 1.0, "give it as a fraction, not in percent")),
     "safety_margin_sigma": (0.0, MOST_FORCE_N, "make the labels again"),
 }
 """Range of each label, and the cure for values outside."""

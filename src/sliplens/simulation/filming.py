@@ -161,7 +161,6 @@ class Film:
     def _shade(self, frames: slice) -> Float[Tensor, "3 frames height width"]:
         """Compute the share of the markers' contrast in each pixel: 0 in the background, about 1 in a marker."""
         centres_px, noise, size_px = self.marker_px[frames], self.sensor.noise, self.sensor.image_size_px
-        # markers outside the frame are skipped
         inside = np.all((centres_px > -_PATCH / 2) & (centres_px < size_px - 1 + _PATCH / 2), axis=-1)
         frame_index, marker_index = np.nonzero(inside)
         centres = _tensor(centres_px[inside])

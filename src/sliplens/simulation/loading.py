@@ -330,7 +330,6 @@ class Motion:
     touch: Float[np.ndarray, " frames"]
     """Indentation over that of the nominal grasp; 0 without contact."""
     nominal_radius_m: float
-    """Contact radius of the nominal grasp."""
     contact_centre_m: Float[np.ndarray, "2"]
     pressure: Float[np.ndarray, "frames markers"]
     """Hertz's pressure on each marker over the peak of the nominal grasp's."""

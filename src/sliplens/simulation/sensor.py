@@ -54,7 +54,6 @@ class Dome:
     ring_counts: tuple[int, ...]
     """Markers in each ring, from the one at the apex outwards."""
     ring_scale: tuple[float, ...]
-    """Marker size by ring."""
 
     @property
     def sphere_radius_m(self) -> float:
@@ -125,7 +124,6 @@ class FlatPad:
 
     ball_radius_m: float
     camera_distance_m: float
-    """Distance from the camera to the skin."""
     focal_px: float
     centre_px: tuple[float, float]
     """Pixel (x, y) at which the middle of the skin is seen."""
@@ -306,7 +304,6 @@ class Sensor:
     name: str
     geometry: Dome | FlatPad
     youngs_modulus_pa: float
-    """Young's modulus of the gel."""
     poisson_ratio: float
     effective_modulus_pa: float | None = None
     """Modulus that the calibrated marker motion needs, core and large strains included; radius and modulus are not

@@ -175,9 +175,8 @@ def read_stills(path: Path, options: ReadOptions) -> list[Capture]:
     table = _join_lists(states) if lists else tables.open_text_table(states)
     rows, rate = list(table.rows), options.frame_rate or 1.0
     table, name_column = replace(table, rows=iter(rows)), find_name_column(table)
-    notes: tuple[str, ...] = (
-        f"{states.name}: stills have no times; they count as {f'{rate:g}' if rate != 1 else 'one'} a second.",
-    )
+    pace = f"{rate:g}" if rate != 1 else "one"
+    notes: tuple[str, ...] = (f"{states.name}: stills have no times; they count as {pace} a second.",)
     if _MARGIN in table.header:
         values, lines, more = tables.read_numbers(table, (_MARGIN,))
         # no margin as a fraction comes near 2, percents all do

@@ -14,8 +14,11 @@ from sliplens.recordings.labelling import Lag
 from sliplens.recordings.labels.axes import find_spans, infer_axes, mean_force, typical_step
 from sliplens.recordings.options import LabelSettings
 
+Frames: TypeAlias = Float[np.ndarray, " frames"]
+Intervals: TypeAlias = Float[np.ndarray, " intervals"]
 
-def measure_motion(softened: Iterable[Soft]) -> Float[np.ndarray, " frames"]:
+
+def measure_motion(softened: Iterable[Soft]) -> Frames:
     """Return the mean absolute difference of softened frames from their predecessors, in grey levels; 0 first."""
     return np.array([0.0, *(np.mean(np.abs(soft - before)) for before, soft in pairwise(softened))], dtype=np.float64)
 
@@ -27,7 +30,7 @@ _MOST_IN_A_ROW = 3
 _LEAST_SHARE, _FEWEST = 0.1, 5
 
 
-def describe_repeats(motion: Float[np.ndarray, " frames"], time_s: Float[np.ndarray, " frames"]) -> str | None:
+def describe_repeats(motion: Frames, time_s: Frames) -> str | None:
     """Describe how many frames repeat the one before, by their `measure_motion`; None where next to none does.
 
     Examples
@@ -56,7 +59,6 @@ def describe_repeats(motion: Float[np.ndarray, " frames"], time_s: Float[np.ndar
     return f"{repeats} of {len(motion)} frames repeat the one before: {rates}; {cure}"
 
 
-Intervals: TypeAlias = Float[np.ndarray, " intervals"]
 # lags tried in the time of a frame, and least step between them; between them the peak is a parabola's
 _STEPS_A_FRAME, _LEAST_LAG_S = 16, 5e-4
 LONGEST_LAG_S = 0.25  #: Longest lag tried, either way.
@@ -75,12 +77,7 @@ _MOVES, _LEAST_MOVES = (0.98, 0.5), 3
 
 
 def estimate_lag(
-    frame_time_s: Float[np.ndarray, " frames"],
-    image_motion: Float[np.ndarray, " frames"],
-    forces: Forces,
-    *,
-    rng: np.random.Generator,
-    draws: int = 200,
+    frame_time_s: Frames, image_motion: Frames, forces: Forces, *, rng: np.random.Generator, draws: int = 200
 ) -> Lag:
     """Estimate the lag by cross-correlation of image motion and force rate, each frame keeping its own time.
 
@@ -143,7 +140,7 @@ def _find_release(forces: Forces, *, sudden_s: float) -> tuple[float, float] | N
     return float(heavy[0]), float(heavy[-1]) - fall_s
 
 
-def force_changes(time_s: Float[np.ndarray, " frames"], forces: Forces) -> Float[np.ndarray, " intervals"]:
+def force_changes(time_s: Frames, forces: Forces) -> Intervals:
     """Return the length of the change of the force from frame to frame; NaN beyond the ends of the samples."""
     # averaged over a frame's time: like the image, the change then covers the whole time since the last frame
     force = mean_force(forces.time_s, forces.force_n, time_s, window_s=typical_step(time_s))
@@ -167,9 +164,7 @@ def doubt_lag(lag: Lag | None, *, applied: bool, frame_s: float) -> str:
     return f"the camera is {late} ({measured}); check that the forces are those of this video, {rate}, and {zero}"
 
 
-def doubt_agreement(
-    frame_time_s: Float[np.ndarray, " frames"], image_motion: Float[np.ndarray, " frames"], forces: Forces, lag: Lag
-) -> tuple[str, ...]:
+def doubt_agreement(frame_time_s: Frames, image_motion: Frames, forces: Forces, lag: Lag) -> tuple[str, ...]:
     """Describe the contacts in which the image does not move as the force changes, a sentence each.
 
     Of the correlations of the values and of their logarithms the larger counts: the first is that of press and slip,
