@@ -230,8 +230,6 @@ def choose_reference(
     `read` reads frames of rising numbers; `index` is the reference by hand, which may touch. Without either, and for a
     number that is not there, a `RecordingError` is raised.
     """
-    from scipy.ndimage import uniform_filter  # noqa: PLC0415 (takes as long to import as all else here)
-
     if index is not None and not 0 <= index < len(untouched):
         raise RecordingError(f"the reference is frame {index} of {len(untouched)}; name one from 0 on that is there")
     if index is not None:
@@ -239,6 +237,8 @@ def choose_reference(
     places = np.flatnonzero(untouched)
     if not len(places):
         raise RecordingError("no frame is known to be untouched; name the reference frame by hand")
+    from scipy.ndimage import uniform_filter  # noqa: PLC0415 (takes as long to import as all else here)
+
     before = places[places - places[:1] == np.arange(len(places))]
     # no more at a time, to bound the memory
     compared = before[np.linspace(0, len(before) - 1, min(len(before), 200)).round().astype(int)].tolist()
