@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -87,7 +88,7 @@ def test_records_in_a_list_are_counted_or_drawn_over_time():
         }
     readings = [Reading(number=at, time_s=at / 30, captured_s=0.0, margin=1 - at / 10) for at in range(5)]
     [line] = [line for line in sl.plot(readings).axes[0].lines if line.get_label() == "predicted"]
-    np.testing.assert_allclose(line.get_xydata(), [(at / 30, 100 - 10 * at) for at in range(5)])
+    np.testing.assert_allclose(np.asarray(line.get_xydata()), [(at / 30, 100 - 10 * at) for at in range(5)])
 
 
 def test_predictions_of_any_trial_are_drawn(results):
