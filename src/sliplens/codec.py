@@ -34,7 +34,7 @@ ARRAYS_FILE = "arrays.npz"  #: Arrays beside it.
 
 Record = TypeVar("Record")
 _Columns = TypeVar("_Columns", bound="Columns")
-Scalar: TypeAlias = str | float | None  #: Cell of a table.
+Scalar: TypeAlias = str | int | float | None  #: Cell of a table.
 
 UNKNOWN = "NaN where it is not known"  #: Beside the bounds of a column or an array: a number may be missing.
 

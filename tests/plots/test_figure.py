@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -80,12 +80,8 @@ def test_records_in_a_list_are_counted_or_drawn_over_time():
     faults = [Violation(where=trial, what=f"fault {number}") for number, trial in enumerate("aba")]
     for counted in (faults, tuple(faults)):
         ax = sl.plot(counted).axes[0]
-        assert {
-            label.get_text(): bar.get_width() for label, bar in zip(ax.get_yticklabels(), ax.patches, strict=True)
-        } == {
-            "a": 2,
-            "b": 1,
-        }
+        names, bars = [label.get_text() for label in ax.get_yticklabels()], cast("Any", ax.patches)
+        assert dict(zip(names, (bar.get_width() for bar in bars), strict=True)) == {"a": 2, "b": 1}
     readings = [Reading(number=at, time_s=at / 30, captured_s=0.0, margin=1 - at / 10) for at in range(5)]
     [line] = [line for line in sl.plot(readings).axes[0].lines if line.get_label() == "predicted"]
     np.testing.assert_allclose(np.asarray(line.get_xydata()), [(at / 30, 100 - 10 * at) for at in range(5)])
