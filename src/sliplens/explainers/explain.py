@@ -6,6 +6,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
+from pathlib import Path
 from typing import Annotated, TypeAlias
 
 import numpy as np
@@ -23,7 +24,7 @@ from sliplens.models import Network
 from sliplens.models.engines import expecting
 from sliplens.progress import number_of, report_each
 from sliplens.results.evaluation import ANSWER
-from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes, require_saliency
+from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes, require_saliency, write_overlays
 from sliplens.results.study import STUDY_BUDGET
 
 _FULL_STICK = 0.9
@@ -100,9 +101,18 @@ _FEW_MAPS = 20
 
 
 def explain_rows(
-    network: Network, chosen: ChosenFrames, explainer: Explainer, rows: Sequence[int], *, maps: int
+    network: Network,
+    chosen: ChosenFrames,
+    explainer: Explainer,
+    rows: Sequence[int],
+    *,
+    maps: int,
+    overlays: Path | None = None,
 ) -> MethodMaps:
-    """Explain some of the frames, by their row numbers, with one explainer; engines are chosen for so many `maps`."""
+    """Explain some of the frames, by their row numbers, with one explainer; engines are chosen for so many `maps`.
+
+    With `overlays`, a folder, each map is drawn there, on the scale of these frames.
+    """
     inputs, references = (
         network.encoding.normalise(values[list(rows)]).to(network.device)
         for values in (chosen.images, chosen.references)
@@ -119,6 +129,9 @@ def explain_rows(
     relevance = attribution.relevance.cpu().numpy()
     for row, values in zip(rows, relevance, strict=True):
         require_saliency(values, inputs.shape[-2:], where=f"the map of {chosen.ids[row]} by {attribution.method}")
+    if overlays is not None:
+        scale = float(network.manifest.unit == "margin")  # that of other units follows from all frames
+        write_overlays(overlays, [chosen.ids[row] for row in rows], _pictures(inputs), relevance, scale=scale)
     gap = attribution.completeness_gap
     notes = MethodNotes(
         seconds_per_frame=attribution.seconds / len(rows),
@@ -174,15 +187,15 @@ def join_maps(
         methods={method: _notes(pieces, reasons, (*chosen.warnings, *warnings)) for method, pieces in maps.items()},
         images=chosen.images.numpy(),
         references=chosen.references.numpy(),
-        pictures=pictures_of(normalised),
+        pictures=_pictures(normalised),
         baseline=chosen.baseline,
         relevance={method: np.concatenate([piece.relevance for piece in pieces]) for method, pieces in maps.items()},
     )
 
 
-def pictures_of(inputs: Float[Tensor, "frames colours size size"]) -> UInt8[np.ndarray, "frames size size 3"]:
+def _pictures(inputs: Float[Tensor, "frames colours size size"]) -> UInt8[np.ndarray, "frames size size 3"]:
     """Return the frames of network inputs in 8 bits, for viewing."""
-    return (255 * frame_of(inputs).permute(0, 2, 3, 1)).round().to(torch.uint8).contiguous().numpy()
+    return (255 * frame_of(inputs.cpu()).permute(0, 2, 3, 1)).round().to(torch.uint8).contiguous().numpy()
 
 
 _MOST_NAMES = 3

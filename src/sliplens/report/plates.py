@@ -12,19 +12,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sliplens.plots import charts, style
-from sliplens.plots.saliency import PictureRow, draw_pictures
+from sliplens.plots.saliency import FrameU8, PictureRow, draw_pictures
 from sliplens.plots.sheets import TIMES, brighten, brightening
 from sliplens.plots.style import percent, reading_words
 from sliplens.report.verdict import ThesisRecord, scores_by_condition
-from sliplens.results.explanation import (
-    BASELINES,
-    Explanation,
-    FrameU8,
-    MovedMarkers,
-    Strip,
-    full_points,
-    overlay_points,
-)
+from sliplens.results.explanation import BASELINES, Explanation, MovedMarkers, Strip, full_points, overlay_points
 from sliplens.results.faithfulness import DeletionScores, is_control
 from sliplens.results.study import Study
 

@@ -13,15 +13,7 @@ from torch import nn
 from sliplens.errors import InputError, SliplensError
 from sliplens.explainers import frames as choosing
 from sliplens.explainers.contract import Explainer
-from sliplens.explainers.explain import (
-    MethodMaps,
-    Methods,
-    choose_explainers,
-    explain_rows,
-    join_maps,
-    pictures_of,
-    with_markers,
-)
+from sliplens.explainers.explain import MethodMaps, Methods, choose_explainers, explain_rows, join_maps, with_markers
 from sliplens.explainers.frames import MARGIN_LEVELS, Baseline, ChosenFrames, FrameSelection
 from sliplens.explainers.occlusion import marker_regions, markers_in_recording, to_network_px
 from sliplens.explainers.table import EXPLAINERS, RECOMMENDED_METHOD
@@ -36,15 +28,7 @@ from sliplens.recordings.dataset import DATASET_FILE
 from sliplens.recordings.options import ReadOptions, option_flags
 from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.recordings.source import SourceOptions, open_source, read_reference
-from sliplens.results.explanation import (
-    BASELINES,
-    Explanation,
-    MovedMarkers,
-    Strip,
-    StripReadings,
-    load_explanation,
-    write_overlays,
-)
+from sliplens.results.explanation import BASELINES, Explanation, MovedMarkers, Strip, StripReadings, load_explanation
 from sliplens.runner import Part, keep_record, part
 from sliplens.simulation.trials import put_markers_back, rebuild_trial, visible_markers
 from sliplens.study.choice import marker_sums, study_explainers, without_markers
@@ -263,19 +247,16 @@ class Explaining(Stage[Explanation]):
 
     def prepare(self) -> MakeRecord:
         """Return the function that explains a batch of frames with one method."""
-        network, chosen = self.trained, self.chosen
-        maps, normalise = len(chosen.ids) * len(self.explainers), network.encoding.normalise
+        maps = len(self.chosen.ids) * len(self.explainers)
 
         def explain_batch(item: tuple[str, int]) -> MethodMaps:
             method, batch = item
-            rows = chosen.batches[batch]
+            rows = self.chosen.batches[batch]
             with reporting(ignore):  # a whole part counts, not its passes
-                made = explain_rows(network, chosen, self.explainers[method], rows, maps=maps)
-            if self.overlays is not None:
-                names, pictures = [chosen.ids[row] for row in rows], pictures_of(normalise(chosen.images[list(rows)]))
-                scale = float(network.manifest.unit == "margin")  # that of another unit is not known yet
-                write_overlays(self.overlays / method, names, pictures, made.relevance, scale=scale)
-            return made
+                overlays = self.overlays and self.overlays / method
+                return explain_rows(
+                    self.trained, self.chosen, self.explainers[method], rows, maps=maps, overlays=overlays
+                )
 
         return explain_batch
 
