@@ -205,7 +205,7 @@ def read_recipe(folder: Path) -> SimulationRecipe:
         fields = {name: msgspec.convert(value, hints[name]) for name, value in stored.items()}
         return SimulationRecipe(sensor=sensor, **fields)
     except (InputError, KeyError, TypeError, AttributeError, ValueError, ArithmeticError):
-        raise InputError(f"{path} holds no recipe; choose a data set that `sliplens simulate` made") from None
+        raise InputError(f"{path} holds no recipe of trials; choose a data set that `sliplens simulate` made") from None
 
 
 def plan_trials(recipe: SimulationRecipe) -> tuple[TrialPlan, ...]:

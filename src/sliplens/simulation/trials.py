@@ -174,7 +174,8 @@ def rebuild_trial(folder: Path, recording: Recording) -> Film:
     # another device or library may draw the same scene with other grey levels, by one at most
     if np.abs(drawn - [recording.reference, recording.frames[last]]).max() > 1:
         cause = "they were changed, or other versions of numpy and torch made them"
-        raise InputError(f"trial {name} of {folder} is not drawn as it is stored: {cause}; simulate the data set again")
+        differs = f"trial {name} of {folder} is drawn differently from its stored frames: {cause}"
+        raise InputError(f"{differs}; simulate the data set again")
     return film
 
 
