@@ -1,20 +1,28 @@
 """Whatever `predict` opens, `explain` opens: the same frames give the same answers, or one sentence says the cure."""
 
 import pickle
+import re
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import torch
-from own_recording import write_images
+from command_line import refused, typed
+from own_recording import write_frames, write_images
+from ros_bags import CAMERA, raw_image, write_bag
 
 import sliplens as sl
 from sliplens.errors import InputError
 from sliplens.images import write_png
 from sliplens.recordings.source import open_source
+from sliplens.results.explanation import load_explanation
 
 NETWORK = "chromatouch-pair"
+SENTENCES = r"sliplens takes 8-bit RGB \(uint8\); |give RGB images"
+TIMES_NS = range(10**18, 10**18 + 120_000_000, 40_000_000)
+"""A frame each 40 ms."""
 
 
 @pytest.fixture(scope="module")
@@ -31,32 +39,33 @@ def write(path: Path, frames: np.ndarray) -> Path:
         np.savez(path, frames=frames, other=np.zeros(2))
     elif path.suffix == ".png":
         write_png(path, frames[1])
+    elif path.suffix == ".mkv":
+        write_frames(path, frames)
+    elif path.name == "bag":
+        write_bag(path, [(CAMERA, raw_image(frame, at), at) for at, frame in zip(TIMES_NS, frames, strict=True)])
     else:
         write_images(path, frames)
     return path
 
 
-TAKEN: dict[str, Callable[[np.ndarray, Path], object]] = {
-    "array": lambda frames, _: frames,
-    "one image": lambda frames, _: frames[1],
-    "list": lambda frames, _: list(frames),
-    "tensor": lambda frames, _: torch.tensor(frames),
-    "tensor, colours first": lambda frames, _: torch.tensor(frames).permute(0, 3, 1, 2),
-    "folder": lambda frames, path: write(path / "frames", frames),
-    "image file": lambda frames, path: write(path / "a.png", frames),
-    "npy": lambda frames, path: write(path / "a.npy", frames),
-    "npz": lambda frames, path: write(path / "a.npz", frames),
+IN_MEMORY: dict[str, Callable[[np.ndarray], object]] = {
+    "array": lambda frames: frames,
+    "one image": lambda frames: frames[1],
+    "list": list,
+    "tensor": torch.tensor,
+    "tensor, colours first": lambda frames: torch.tensor(frames).permute(0, 3, 1, 2),
 }
-REFUSED: dict[str, Callable[[np.ndarray], object]] = {
-    "floats in [0, 1]": lambda frames: torch.tensor(frames) / 255,
+FILES = ("frames", "a.png", "a.npy", "a.npz", "a.mkv", "bag")
+REFUSED: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "floats in [0, 1]": lambda frames: frames / np.float32(255),
     "grey": lambda frames: frames[..., 0],
     "16 bits": lambda frames: frames.astype(np.uint16) * 256,
 }
 
 
-@pytest.mark.parametrize("kind", TAKEN)
+@pytest.mark.parametrize("kind", [*IN_MEMORY, *FILES])
 def test_predict_and_explain_see_the_same_frames(kind: str, frames: np.ndarray, tmp_path: Path):
-    source = TAKEN[kind](frames, tmp_path)
+    source = IN_MEMORY[kind](frames) if kind in IN_MEMORY else write(tmp_path / kind, frames)
     expected, predicted = (
         sl.predict(NETWORK, images, reference=reference).to_arrow()["prediction"].to_numpy()
         for images, reference in ((frames, frames[1]), (source, torch.tensor(frames[1])))
@@ -71,13 +80,27 @@ def test_predict_and_explain_see_the_same_frames(kind: str, frames: np.ndarray, 
     warnings = [text for text in explanation.methods["grad-cam"].warnings if "the prediction is withheld" in text]
     assert len(warnings) == bool(withheld)
     assert all(name in warnings[0] for name in withheld)
+    if kind in FILES:  # and so do the commands
+        words = NETWORK, source, "--reference", write(tmp_path / "untouched.png", frames)
+        typed("predict", *words, "-o", tmp_path / "margins.parquet")
+        typed("explain", *words, "--method", "grad-cam", "-o", tmp_path / "maps")
+        np.testing.assert_array_equal(pq.read_table(tmp_path / "margins.parquet")["prediction"].to_numpy(), predicted)
+        maps = load_explanation(tmp_path / "maps")
+        np.testing.assert_allclose([frame.prediction for frame in maps.frames], explained, atol=1e-6)
 
 
 @pytest.mark.parametrize("call", [sl.predict, sl.explain])
 @pytest.mark.parametrize("kind", REFUSED)
-def test_levels_and_layouts_that_may_mean_two_things_are_refused(call: Callable, kind: str, frames: np.ndarray):
-    with pytest.raises(InputError, match=r"sliplens takes 8-bit RGB \(uint8\); |give RGB images"):
-        call(NETWORK, REFUSED[kind](frames), reference=frames[1])
+def test_levels_and_layouts_that_may_mean_two_things_are_refused(
+    call: Callable, kind: str, frames: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    images = REFUSED[kind](frames)
+    for source in (images, torch.tensor(images)):
+        with pytest.raises(InputError, match=SENTENCES):
+            call(NETWORK, source, reference=frames[1])
+    words = call.__name__, NETWORK, write(tmp_path / "a.npy", images), "-o", tmp_path / "out.csv"
+    assert re.search(SENTENCES, refused(capsys, *words))
+    assert [*tmp_path.iterdir()] == [tmp_path / "a.npy"]
 
 
 @pytest.mark.parametrize("junk", [[], {}, 3.5, ["frames"], np.zeros(4, dtype=np.uint8), [np.zeros((4, 4, 3))]])

@@ -12,7 +12,7 @@ from importlib import import_module
 from inspect import Parameter, Signature, signature
 from itertools import pairwise
 from pathlib import Path
-from types import NoneType, UnionType
+from types import NoneType, SimpleNamespace, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, Union, Unpack, get_args, get_origin, get_type_hints
 
 import cyclopts
@@ -128,7 +128,7 @@ def adapt(command: Command) -> tuple[Callable[..., object], list[str]]:
 
 
 def _load(command: Command) -> Callable[..., object]:
-    """Import the function of a command without what takes seconds and is of no use to a command."""
+    """Import the function of a command without what takes time and is of no use to a command."""
     module, _, name = command.function.partition(":")
     gc.disable()  # else it searches the imported objects, which stay, time and again
     try:
@@ -136,20 +136,16 @@ def _load(command: Command) -> Callable[..., object]:
     finally:
         gc.enable()
     if pyarrow := sys.modules.get("pyarrow"):
-        sys.meta_path.insert(0, _WithoutPandas)  # pyright: ignore[reportArgumentType]
+        finder: Any = SimpleNamespace(find_spec=_refuse_pandas)
+        sys.meta_path.insert(0, finder)
         pyarrow.array([])  # looks for pandas here and not again
-        sys.meta_path.remove(_WithoutPandas)  # pyright: ignore[reportArgumentType]
+        sys.meta_path.remove(finder)
     return function
 
 
-class _WithoutPandas:
-    """Finder of modules that finds no pandas."""
-
-    @staticmethod
-    def find_spec(name: str, *_: object) -> None:
-        """Refuse pandas; other finders look for any other module."""
-        if name == "pandas":
-            raise ImportError(name)
+def _refuse_pandas(name: str, *_: object) -> None:
+    if name == "pandas":
+        raise ImportError(name)
 
 
 def _options(kind: Any, command: Command, *, skip: int = 0, group: str = "") -> dict[str, _Option]:

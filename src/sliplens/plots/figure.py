@@ -175,7 +175,7 @@ def _rows(result: Any, ax: Axes, _: int | None) -> None:
         values, words = charts.column(table, name), name.replace("_", " ")
         labels = [f"{number}  {style.method_name(text)}" for number, text in enumerate(texts[0])] if texts else []
     else:
-        counts = Counter(min(texts, key=lambda column: (len({*column}), len("".join(column)))))
+        counts = Counter(min(texts, key=lambda column: (len({*column}), len("".join(map(str, column))))))
         labels, values, words = [*counts], np.array([*counts.values()]), "number of rows"
     if len(values) > _MOST_BARS or not labels:
         ax.plot(values, color=style.BLUE)
