@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -32,18 +33,29 @@ def main() -> None:
 
 
 def measure(folder: Path) -> dict[str, float]:
-    """Seconds of each command."""
+    """Seconds of each command, and those that it kept processors busy, which other programs hardly change."""
     images = folder / "images"
     images.mkdir()
     draw_images(images)
-    network = "chromatouch-difference"
     run("--version")  # what lies on disk is then in memory, as after any first command
-    predict = ("predict", network, str(images))
-    numbers = {"predict_s": run(*predict, "-o", str(folder / "margins.csv"))}
-    numbers["refused_s"] = run(*predict, "-o", str(folder / "margins.txt"), code=2)
-    maps = folder / "maps"
-    numbers["explain_first_s"] = first_picture(maps, "explain", network, "--frames", str(images), "-o", str(maps))
+    words, maps = ("chromatouch-difference", "--frames", str(images)), folder / "maps"
+    actions = {
+        "predict": partial(run, "predict", words[0], words[2], "-o", str(folder / "margins.csv")),
+        "refused": partial(run, "predict", words[0], words[2], "-o", str(folder / "margins.txt"), code=2),
+        "explain_first": partial(draw_first, maps, "explain", *words, "-o", str(maps)),
+    }
+    numbers = {}
+    for name, action in actions.items():
+        began, busy = time.perf_counter(), processor_s()
+        action()
+        numbers |= {f"{name}_s": time.perf_counter() - began, f"{name}_processor_s": processor_s() - busy}
     return numbers
+
+
+def processor_s() -> float:
+    """Seconds that ended commands kept processors busy."""
+    times = os.times()
+    return times.children_user + times.children_system
 
 
 def draw_images(folder: Path) -> None:
@@ -59,28 +71,23 @@ def draw_images(folder: Path) -> None:
         Image.fromarray(np.repeat(pixels[..., None], 3, axis=2)).save(folder / f"frame{number}.png")
 
 
-def run(*words: str, code: int = 0) -> float:
-    """Seconds of a command, which must end with this exit code."""
-    began = time.perf_counter()
+def run(*words: str, code: int = 0) -> None:
+    """Run a command, which must end with this exit code."""
     ended = subprocess.run([sys.executable, "-m", "sliplens", *words], capture_output=True, text=True, check=False)
     if ended.returncode != code:
         raise SystemExit(f"sliplens {' '.join(words)} ended with {ended.returncode}: {ended.stderr}")
-    return time.perf_counter() - began
 
 
-def first_picture(folder: Path, *words: str) -> float:
-    """Seconds until a command has drawn a first map; it is ended then."""
-    began = time.perf_counter()
+def draw_first(folder: Path, *words: str) -> None:
+    """Run a command until it has drawn a first map."""
     command = [sys.executable, "-m", "sliplens", *words]
     overlays = folder.with_name(f".{folder.name}.partial") / "overlays", folder / "overlays"
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=dict(os.environ)) as asked:
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as asked:
         while asked.poll() is None and not any(one.is_dir() and any(one.rglob("*.png")) for one in overlays):
             time.sleep(0.02)
-        took = time.perf_counter() - began
         if asked.poll() not in {None, 0}:
             raise SystemExit(f"sliplens {' '.join(words)} ended with {asked.returncode}")
-        asked.terminate()
-    return took
+        asked.kill()
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """Explanations of frames by one or several methods, and a strip of one trial."""
 
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -11,7 +12,7 @@ from jaxtyping import Float, Float32, Float64, Shaped, UInt8
 
 from sliplens.codec import UNKNOWN, Columns, Result, load_record, load_result
 from sliplens.errors import InputError, SaliencyError
-from sliplens.files import RUN_FILE, Provenance, require_folder, whole_file
+from sliplens.files import RUN_FILE, Provenance, require_folder
 from sliplens.images import write_png
 from sliplens.progress import number_of
 from sliplens.results.evaluation import AMOUNT, ANSWER, MARGIN, TIME, OfOutput
@@ -222,10 +223,11 @@ def write_overlays(
     scale: float,
 ) -> list[FrameU8]:
     """Write an overlay of every map into a folder, whole or not at all, and return them."""
-    overlays = overlay_points(pictures, relevance, scale=scale)
+    overlays, part = overlay_points(pictures, relevance, scale=scale), folder / f".{os.getpid()}"
+    folder.mkdir(parents=True, exist_ok=True)
     for name, overlay in zip(names, overlays, strict=True):
-        with whole_file(folder / f"{name}.png") as part:
-            write_png(part, overlay)
+        write_png(part, overlay)
+        part.replace(folder / f"{name}.png")
     return overlays
 
 
