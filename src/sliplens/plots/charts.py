@@ -32,12 +32,11 @@ def plot_margins(rows: pa.Table, *, ax: Axes, unit: str = "margin") -> Axes:
     across = column(rows, "time_s" if timed else "frame")
     _shade_withheld(across, rows["withheld"].to_pylist(), ax=ax)
     of_margin = unit == "margin"
+    scale, known = (100, {*rows.column_names}) if of_margin else (1, {"prediction"})
     prediction, low, high, true = (
-        100 * column(rows, name) if name in rows.column_names else np.full(len(rows), np.nan)
+        scale * column(rows, name) if name in known else np.full(len(rows), np.nan)
         for name in ("prediction", "low_90", "high_90", "safety_margin")
     )
-    if not of_margin:
-        prediction, low, high, true = prediction / 100, *3 * [np.full(len(rows), np.nan)]
     if np.isfinite(low).any():  # a network that was never calibrated has none
         ax.fill_between(across, low, high, color=style.BLUE, alpha=0.18, linewidth=0, label="90 % interval")
     # few frames have a dot each: one alone makes no line

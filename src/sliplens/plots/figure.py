@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sized
+from collections.abc import Callable, Mapping
 from dataclasses import is_dataclass
 from pathlib import Path
 from textwrap import fill as wrap
@@ -168,7 +168,8 @@ def _rows(result: Any, ax: Axes, _: int | None) -> None:
     kinds = dict(zip(table.column_names, table.schema.types, strict=True))
     numbers = [name for name, kind in kinds.items() if COLUMN_KINDS["numbers"](kind)]
     texts = [table[each].to_pylist() for each, kind in kinds.items() if COLUMN_KINDS["texts"](kind)]
-    if not len(table) or not (numbers or (texts and isinstance(result, Sized))):
+    least = 1 if numbers or table is result else 2  # one row of texts is no table
+    if len(table) < least or not (numbers or texts):
         raise InputError("there is nothing to draw: this result holds no number, or is empty")
     if numbers:
         name = next((name for name in numbers if name == "frames" or pa.types.is_floating(kinds[name])), numbers[0])
@@ -239,6 +240,23 @@ def _network(network: Any, ax: Axes, _: int | None) -> None:
     charts.plot_learning_curves({network.training.input: network.training}, ax=ax)
 
 
+def _proposal(proposal: SensorProposal, ax: Axes, _: int | None) -> None:
+    """Draw the camera's frame with gel, crop and markers."""
+    frame, markers = proposal.picture, proposal.markers_px
+    ax.imshow(frame)
+    crop = proposal.profile.crop_px or (0, 0, frame.shape[1], frame.shape[0])
+    for (x, y, *size), colour, words in ((proposal.gel_px, style.BLUE, "gel"), (crop, style.VERMILLION, "crop_px")):
+        box = {"fill": False, "color": colour, "linewidth": 1.6, "label": words}
+        ax.add_patch(Rectangle((x - 0.5, y - 0.5), *size, **box))
+    if len(markers):
+        words = f"{len(markers)} markers ({proposal.profile.markers})"
+        ax.plot(*markers.T, "o", mfc="none", mec="white", ms=9, label=words)
+    ax.set(title="camera", xlabel="x in pixels", ylabel="y in pixels")
+    below = {"bbox_to_anchor": (0.5, -0.16), "facecolor": "0.7"}  # rings are white
+    ax.legend(loc="upper center", ncols=3, frameon=True, **below)
+    ax.grid(visible=False)
+
+
 _MOST_BARS = 40
 DRAWERS: dict[str, Callable[[Any, Axes, int | None], object]] = {
     "Evaluation": lambda result, ax, _: charts.plot_predictions(result.predictions, ax=ax),
@@ -259,7 +277,7 @@ DRAWERS: dict[str, Callable[[Any, Axes, int | None], object]] = {
     "Hold": lambda result, ax, _: charts.plot_grip_force(result.steps.to_arrow(), ax=ax).set_title(result.controller),
     "Recording": lambda result, ax, _: plot_margin(result, ax=ax).set_title(result.trial, parse_math=False),
     "Strip": lambda result, ax, _: charts.plot_readings(result, ax=ax),
-    "SensorProposal": lambda result, ax, _: _plot_proposal(result, ax=ax),
+    "SensorProposal": _proposal,
 }
 """Functions that draw a record, by the name of its class."""
 
@@ -270,29 +288,12 @@ def write_proposal(proposal: SensorProposal, path: Path) -> None:
     with style.drawing_style(), style.written_whole(path) as part:
         figure = Figure(figsize=(9.6, 4.6), layout="constrained")
         camera, made = figure.subplots(1, 2, width_ratios=(frame.shape[1] / frame.shape[0], 1.0))
-        _plot_proposal(proposal, ax=camera)
+        _proposal(proposal, camera, None)
         made.imshow(profile.apply(frame))
         apart = f" (markers {proposal.spacing_px:.1f} apart)" if np.isfinite(proposal.spacing_px) else ""
         made.set(title=f"{profile.name}, after the profile", xlabel=f"x in pixels{apart}", ylabel="y in pixels")
         made.grid(visible=False)
         figure.savefig(part, dpi=120, format="png")
-
-
-def _plot_proposal(proposal: SensorProposal, *, ax: Axes) -> None:
-    """Draw the camera's frame with gel, crop and markers."""
-    frame, markers = proposal.picture, proposal.markers_px
-    ax.imshow(frame)
-    crop = proposal.profile.crop_px or (0, 0, frame.shape[1], frame.shape[0])
-    for (x, y, *size), colour, words in ((proposal.gel_px, style.BLUE, "gel"), (crop, style.VERMILLION, "crop_px")):
-        box = {"fill": False, "color": colour, "linewidth": 1.6, "label": words}
-        ax.add_patch(Rectangle((x - 0.5, y - 0.5), *size, **box))
-    if len(markers):
-        words = f"{len(markers)} markers ({proposal.profile.markers})"
-        ax.plot(*markers.T, "o", mfc="none", mec="white", ms=9, label=words)
-    ax.set(title="camera", xlabel="x in pixels", ylabel="y in pixels")
-    below = {"bbox_to_anchor": (0.5, -0.16), "facecolor": "0.7"}  # rings are white
-    ax.legend(loc="upper center", ncols=3, frameon=True, **below)
-    ax.grid(visible=False)
 
 
 def make_profile(

@@ -33,9 +33,6 @@ class SplitResult(Result):
     notes: tuple[str, ...]
     """Sentences about rows without effect, splits without trials, objects or days in both train and test."""
 
-    def __len__(self) -> int:
-        return len(self.trials)
-
     def to_arrow(self) -> pa.Table:
         """Return a row for each trial: its name and its split."""
         return pa.table({"trial": self.trials, "split": self.splits})
