@@ -25,9 +25,8 @@ from sliplens.models.checkpoint import Estimate, Network
 from sliplens.models.engines import Engine, make_engine
 from sliplens.models.wrapping import Preprocess, open_run
 from sliplens.progress import OnProgress, add_note, number_of, open_stage, report_progress, reporting
-from sliplens.recordings import Dataset, load_dataset
+from sliplens.recordings import Dataset
 from sliplens.recordings.capture import Capture
-from sliplens.recordings.dataset import DATASET_FILE
 from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.recordings.source import Frame, SourceOptions, Trials, open_trials
 from sliplens.recordings.trial import ContactState
@@ -234,8 +233,6 @@ def predict(
         with open_stage("Opening the source"):
             trials = open_trials(recordings, on=on, resumable=path is not None, **source_options)
         data = trials.source
-        if isinstance(data, Path) and (data / DATASET_FILE).is_file():
-            data = load_dataset(data)
         if profile is None and isinstance(data, Dataset):
             profile = data.profile(data.trials[0].sensor)
         if network is None:
