@@ -16,6 +16,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import MaxNLocator
 
 from sliplens.codec import COLUMN_KINDS, Columns, Result, table_rows
 from sliplens.errors import InputError
@@ -178,6 +179,7 @@ def _rows(result: Any, ax: Axes, _: int | None) -> None:
     else:
         counts = Counter(min(texts, key=lambda column: (len({*column}), len("".join(map(str, column))))))
         labels, values, words = [*counts], np.array([*counts.values()]), "number of rows"
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     if len(values) > _MOST_BARS or not labels:
         ax.plot(values, color=style.BLUE)
         ax.set(xlabel="Row", ylabel=words)
