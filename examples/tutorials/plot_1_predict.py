@@ -2,7 +2,8 @@
 Predict the margin of a recording
 =================================
 
-Predict the safety margin of every frame of a video: a figure and a table with a 90 % interval a frame. Compare it with
+Predict the safety margin of every frame of a video: a figure and a table with a 90 % interval a frame. One command does
+it: ``sliplens predict chromatouch-pair cup.mkv --reference-frame 0 --plot cup.png``. Then compare the margins with
 labels computed from measured forces. Touch is simulated here; accuracy on real touch is nearly untested.
 """
 
@@ -37,8 +38,7 @@ with av.open(folder / "cup.mkv", "w") as video:
 # %%
 # Predict
 # -------
-# Frame 0 shows the sensor before the contact. On the command line:
-# ``sliplens predict chromatouch-pair cup.mkv --reference-frame 0 --plot cup.png``.
+# Frame 0 shows the sensor before the contact.
 predictions = sl.predict("chromatouch-pair", folder / "cup.mkv", reference_frame=0)
 figure, ax = plt.subplots(figsize=(9, 3.8), layout="constrained")
 sl.plot(predictions, ax)

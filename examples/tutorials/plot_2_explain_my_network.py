@@ -2,8 +2,9 @@
 Explain and test my own regressor
 =================================
 
-Explain any PyTorch module with one output an image: signed maps in the unit of the output. A score then tests whether
-the maps can be trusted. The example is not about touch: the network estimates the slant of a handwritten digit.
+Explain any PyTorch module with one output an image: ``maps = sl.explain(module, frames)`` has signed maps in the unit
+of the output, and ``sl.score(module, maps)`` tests whether they can be trusted. The example is not about touch: the
+network estimates the slant of a handwritten digit.
 """
 
 import matplotlib.pyplot as plt

@@ -2,7 +2,8 @@
 Train a network for your sensor
 ===============================
 
-A network that was trained on another sensor is often wrong on yours. Ten labelled trials and some minutes adapt it.
+A network that was trained on another sensor is often wrong on yours. Ten labelled trials and some minutes adapt it:
+``sliplens train DATA -o RUN --recipe adapt --start-from chromatouch-pair``.
 Here three epochs on small images show the steps within a minute; their accuracy is not that of a whole training.
 """
 
@@ -27,8 +28,7 @@ before = sl.evaluate("chromatouch-pair", data)
 # %%
 # Adapt it
 # --------
-# Only `recipe` and `start_from` are needed; the other arguments make this page short. On the command line:
-# ``sliplens train DATA -o RUN --recipe adapt --start-from chromatouch-pair``.
+# Only `recipe` and `start_from` are needed; the other arguments make this page short.
 network = sl.train(
     data, recipe="adapt", start_from="chromatouch-pair", image_size=96, epochs=3, epoch_frames=160, batch_size=16
 )

@@ -2,7 +2,8 @@
 Predict live, and control a grip
 ================================
 
-Predict the margin of a running camera, and control a grip force with it. Camera and gripper are simulated here; neither
+Predict the margin of a running camera (``sliplens live 0 --network chromatouch-pair``), and control a grip force with
+it (``sliplens hold 0 --network chromatouch-pair --gripper ADDRESS``). Camera and gripper are simulated here; neither
 was tested on a real fingertip or robot.
 """
 
@@ -18,7 +19,7 @@ import sliplens as sl
 # Live
 # ----
 # ``sl.read_live(0, "chromatouch-pair")`` opens the first camera. This page replays a stored trial at its
-# recorded speed. ``sliplens live 0 --network chromatouch-pair`` opens a page in the browser.
+# recorded speed.
 folder = Path(mkdtemp()) / "replayed"
 sl.simulate(folder, dry_trials=4, wet_trials=1, days=4, frames_per_trial=120)
 readings = list(sl.read_live(folder, "chromatouch-pair", seconds=9.0))
@@ -47,8 +48,7 @@ plt.show()
 # Grip
 # ----
 # `run_episodes` simulates a gripper that holds a cup which gets wet. ``fixed`` uses one force, ``margin`` the predicted
-# margin, ``oracle`` the true one. The same 200 episodes for each; predictions have the measured
-# errors of the network. With a real gripper: ``sliplens hold 0 --network chromatouch-pair --gripper ADDRESS``.
+# margin, ``oracle`` the true one. The same 200 episodes for each; predictions have the measured errors of the network.
 grips = {
     name: sl.run_episodes("cup", name, condition="patch", episodes=200, seed=5)
     for name in ("fixed", "margin", "oracle")
