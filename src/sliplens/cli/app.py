@@ -1,10 +1,8 @@
 """Commands made of functions: options, defaults, types and help come from signature and docstring."""
 
 import ast
-import gc
 import inspect
 import re
-import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import cached_property, partial
@@ -12,7 +10,7 @@ from importlib import import_module
 from inspect import Parameter, Signature, signature
 from itertools import pairwise
 from pathlib import Path
-from types import NoneType, SimpleNamespace, UnionType
+from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, Union, Unpack, get_args, get_origin, get_type_hints
 
 import cyclopts
@@ -93,7 +91,8 @@ class _Option(NamedTuple):
 
 def adapt(command: Command) -> tuple[Callable[..., object], list[str]]:
     """Return the function that cyclopts calls for a command, and the names of its options."""
-    function = _load(command)
+    module, _, name = command.function.partition(":")
+    function = getattr(import_module(module), name)
     hints = get_type_hints(function)
     for hint in [hint for hint in hints.values() if get_origin(hint) is Unpack]:
         hints |= get_type_hints(get_args(hint)[0])
@@ -125,27 +124,6 @@ def adapt(command: Command) -> tuple[Callable[..., object], list[str]]:
     call.__signature__ = Signature(parameters)  # pyright: ignore[reportFunctionMemberAccess]
     call.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return call, names
-
-
-def _load(command: Command) -> Callable[..., object]:
-    """Import the function of a command without what takes time and is of no use to a command."""
-    module, _, name = command.function.partition(":")
-    gc.disable()  # else it searches the imported objects, which stay, time and again
-    try:
-        function = getattr(import_module(module), name)
-    finally:
-        gc.enable()
-    if pyarrow := sys.modules.get("pyarrow"):
-        finder: Any = SimpleNamespace(find_spec=_refuse_pandas)
-        sys.meta_path.insert(0, finder)
-        pyarrow.array([])  # looks for pandas here and not again
-        sys.meta_path.remove(finder)
-    return function
-
-
-def _refuse_pandas(name: str, *_: object) -> None:
-    if name == "pandas":
-        raise ImportError(name)
 
 
 def _options(kind: Any, command: Command, *, skip: int = 0, group: str = "") -> dict[str, _Option]:

@@ -32,9 +32,9 @@ def plot_margins(rows: pa.Table, *, ax: Axes, unit: str = "margin") -> Axes:
     across = column(rows, "time_s" if timed else "frame")
     _shade_withheld(across, rows["withheld"].to_pylist(), ax=ax)
     of_margin = unit == "margin"
-    scale, known = (100, {*rows.column_names}) if of_margin else (1, {"prediction"})
+    scale, drawn = (100, {*rows.column_names}) if of_margin else (1, {"prediction"})
     prediction, low, high, true = (
-        scale * column(rows, name) if name in known else np.full(len(rows), np.nan)
+        scale * column(rows, name) if name in drawn else np.full(len(rows), np.nan)
         for name in ("prediction", "low_90", "high_90", "safety_margin")
     )
     if np.isfinite(low).any():  # a network that was never calibrated has none
