@@ -155,15 +155,10 @@ class RosCommand(NamedTuple):
     """Returns the fields of the message, in order, for a force in newtons."""
 
 
-_LEAST_EFFORT_N = 0.01  # effort in place of 0, which some drivers take for no limit
-_DEFINITIONS = {  # of types that ROS itself does not bring
-    "control_msgs/msg/GripperCommand": "float64 position\nfloat64 max_effort"
-}
+_GRIPPER_COMMAND = "control_msgs/msg/GripperCommand"
 ROS_MESSAGES = {
-    # closed as far as the effort brings it
-    "gripper-command": RosCommand(
-        "command", "control_msgs/msg/GripperCommand", lambda n: (0.0, max(n, _LEAST_EFFORT_N))
-    ),
+    # closed as far as the effort brings it; some drivers take an effort of 0 for no limit
+    "gripper-command": RosCommand("command", _GRIPPER_COMMAND, lambda n: (0.0, max(n, 0.01))),
     # forward controllers of ros2_control take a number a joint
     "controllers": RosCommand(
         "effort_controller/commands",
@@ -197,9 +192,9 @@ class RosGripper:
         self._topic, self._joint, self.timeout_s = f"{key}/{_STATE_TOPIC}", joint, timeout_s
         self._message, self._message_s, self._new = b"", -math.inf, threading.Condition()
         try:
-            if (kind := self._command.kind) in _DEFINITIONS:
-                self._ros.define(kind, _DEFINITIONS[kind])
-            self._publish = self._ros.publisher(f"{key}/{self._command.topic}", kind)
+            # a type that ROS itself does not bring
+            self._ros.define(_GRIPPER_COMMAND, "float64 position\nfloat64 max_effort")
+            self._publish = self._ros.publisher(f"{key}/{self._command.topic}", self._command.kind)
             self._ros.subscribe(self._topic, _STATE_KIND, self._receive)
             self._await_state(3.0)
         except Exception as error:  # whatever Zenoh or a package's messages raise

@@ -32,7 +32,6 @@ from sliplens.live.contract import Pace
 from sliplens.live.loop import LiveReader
 from sliplens.live.reading import LiveFrame, Reading
 
-_TRIES = 30  # for the first force, half a second: a driver may start late
 _STUCK_S, _STUCK_M = 2.0, 1e-4
 """Time in which a gripper without any force has to close by a tenth of a millimetre; the simulated one opens for 1.5 s
 first."""
@@ -169,7 +168,7 @@ class HoldLoop:
         self.steps: list[HoldStep] = []
         self.troubles: dict[str, None] = {}
         """Faults of the gripper, in the order in which they first came."""
-        for _ in range(_TRIES):
+        for _ in range(30):  # half a second: a driver may start late
             state, trouble = self._measure()
             if not math.isnan(state.force_n):
                 break

@@ -206,8 +206,6 @@ def risk_coverage(
 
 THRESHOLD = 0.2
 """A margin below it is an alarm: people hold 20 to 40 % above the least force."""
-_FALSE_ABOVE = 2.0
-"""An alarm that begins while the true margin is above so many thresholds is false, not early."""
 
 
 def lead_times(predictions: ScoredFrames) -> LeadTimes:
@@ -222,8 +220,8 @@ def lead_times(predictions: ScoredFrames) -> LeadTimes:
         before = frames.where(np.arange(*slip or [len(frames)]))
         if not len(before):
             continue
-        alarms, high = before.prediction < THRESHOLD, before.safety_margin > _FALSE_ABOVE * THRESHOLD
-        begins = alarms & ~np.insert(alarms[:-1], 0, False)
+        alarms, high = before.prediction < THRESHOLD, before.safety_margin > 2 * THRESHOLD
+        begins = alarms & ~np.insert(alarms[:-1], 0, False)  # while the margin is high, false, not early
         false += int((begins & high).sum())
         minutes += float(before.time_s[-1] - before.time_s[0]) / 60
         slips += len(slip)
