@@ -4,7 +4,6 @@ import ast
 import doctest
 import importlib.util
 import inspect
-import pkgutil
 import re
 import types
 import typing
@@ -18,6 +17,7 @@ import pytest
 import torch
 
 import sliplens
+from sliplens.explainers.contract import Explainer
 
 ROOT = Path(__file__).parents[1]
 API_PAGE = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
@@ -26,33 +26,35 @@ API_PAGES = "".join(page.read_text(encoding="utf-8") for page in sorted((ROOT / 
 UNIT_IN_NAME = re.compile(r"_(n|m|pa|px|s|ms|hz|deg|rad)$|(seconds|minutes|percent)$|_per_")
 """House style: a number of a physical quantity has its unit in its name."""
 NONE_IN_NAME = re.compile(
-    r"coefficient|ratio|share|margin|exponent|quantile|level|strain|temperature|factor|learning_rate|fraction|score|auroc"
+    r"coefficient|ratio|share|margin|exponent|quantile|level|strain|temperature|factor|learning_rate|fraction|score|auroc|^mu$"
 )
 """Names of what has no unit: ratios of two things alike, and margins, which are one."""
 UNIT_IN_WORDS = re.compile(
     r"\b(newtons?|metres?|pascals?|pixels?|seconds?|minutes?|hertz|degrees?|radians?|grey levels?|margin units|percent"
-    r"|shares?|ratio|part|coefficient|standard deviations?|0 to 1)\b",
+    r"|points of margin|shares?|ratio|part|coefficient|correlation|standard deviations?|0 to 1|unit of)\b",
     re.IGNORECASE,
 )
 """Or the sentence that describes it says the unit, or what it is a share of."""
 
 
-def public_modules() -> list[types.ModuleType]:
-    """The package, and every package and module below it that says what it exports; a command has its --help."""
-    names = [info.name for info in pkgutil.walk_packages(sliplens.__path__, "sliplens.")]
-    modules = [
-        importlib.import_module(name)
-        for name in ("sliplens", *names)
-        if not name.startswith("sliplens.cli") and not any(part.startswith("_") for part in name.split("."))
+def exports(module: types.ModuleType) -> list[str]:
+    """Names that a package lists, or public functions and classes that a module defines."""
+    return getattr(module, "__all__", None) or [
+        name
+        for name, thing in vars(module).items()
+        if (inspect.isclass(thing) or inspect.isfunction(thing))
+        and thing.__module__ == module.__name__
+        and name[0] != "_"
     ]
-    return [module for module in modules if hasattr(module, "__all__")]
 
 
-MODULES = public_modules()
+DESCRIBED = re.findall(r"^\.\. automodule:: (\S+)$", API_PAGES, flags=re.MULTILINE)
+MODULES = [importlib.import_module(name) for name in ("sliplens", *DESCRIBED)]
+"""The package, and what the pages of the interface describe; a command has its --help."""
 EXPORTED = [
     pytest.param(module, name, getattr(module, name), id=f"{module.__name__}.{name}")
     for module in MODULES
-    for name in module.__all__
+    for name in exports(module)
     if name != "__version__"
 ]
 CALLABLE = [row for row in EXPORTED if inspect.isclass(row.values[2]) or inspect.isfunction(row.values[2])]
@@ -90,7 +92,7 @@ def string_below(module: types.ModuleType, name: str) -> str:
 
 def parameters(thing: object) -> Iterator[tuple[str, object]]:
     """Names and types of what a function takes and gives, or of what a record holds."""
-    hints = typing.get_type_hints(thing)
+    hints = typing.get_type_hints(thing, localns={"Explainer": Explainer})  # its table is read without torch
     if inspect.isclass(thing):
         hints = {field.name: hints[field.name] for field in fields(thing)} if is_dataclass(thing) else {}
     for name, hint in hints.items():

@@ -27,7 +27,7 @@ import pyarrow.parquet as pq
 from jaxtyping import AbstractArray, jaxtyped
 
 from sliplens.errors import InputError, SliplensError
-from sliplens.files import read_json, require_file, to_builtins, whole_file, write_json
+from sliplens.files import read_json, require_file, whole_file, write_json
 
 RESULT_FILE = "result.json"  #: Record of a folder.
 ARRAYS_FILE = "arrays.npz"  #: Arrays beside it.
@@ -507,9 +507,3 @@ def _cure(command: str) -> str:
 def one_line(error: Exception) -> str:
     """Text of an error, without the line breaks and stacks of Arrow."""
     return " ".join(str(error).split())[:200]
-
-
-__all__ = [
-    "Columns", "Result", "from_builtins", "load_record", "load_result", "save_result", "to_builtins", "write_json",
-    "write_tables",
-]  # fmt: skip

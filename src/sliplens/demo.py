@@ -107,6 +107,3 @@ def _make_strip(folder: Path, data: Dataset, network: str) -> None:
             return make_strip(run, data.load(info), source=data.source, method=STRIP_METHOD, folder=data.folder)
 
     keep_record(folder, make, stage="strip", config=config, what="a grip from stick to slip")
-
-
-__all__ = ["run_demo"]

@@ -56,9 +56,3 @@ class ModelError(SliplensError):
 
 class SaliencyError(SliplensError):
     """A saliency map that does not fit its image or is not finite."""
-
-
-__all__ = [
-    "CheckpointError", "ContactError", "ImageError", "InputError", "ModelError", "PartError", "RecordingError",
-    "SaliencyError", "SliplensError", "SourceError",
-]  # fmt: skip

@@ -274,6 +274,3 @@ def _unknown(near: Float[np.ndarray, " values"] | None = None) -> Friction:
         low = min(low, float(near.min()) * math.exp(-_REACH * GRASP_SPREAD))
         high = min(MOST_FRICTION, max(high, float(near.max()) * math.exp(_REACH * GRASP_SPREAD)))
     return Friction(np.geomspace(low, high, _NODES), note="unknown")
-
-
-__all__ = ["Friction", "FrictionLike", "SlipLearner", "as_friction"]

@@ -10,14 +10,12 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Shaped, UInt8
 from PIL import ExifTags, Image, ImageOps
 
 from sliplens.errors import ImageError, InputError
 from sliplens.extras import import_cv2, missing_packages
 from sliplens.files import require_file, require_folder
-
-__all__ = ["absolute_difference", "as_frames", "list_images", "read_image", "signed_difference", "write_png"]
 
 Buffer: TypeAlias = Any  #: Bytes of a file in memory, or an image of Pillow.
 Images: TypeAlias = Any  #: Images that `as_frames` takes: an array, a PyTorch tensor, an image, or a list of them.
@@ -351,7 +349,7 @@ def as_frames(images: Images, *, what: str = "frames") -> UInt8[np.ndarray, "fra
     return images
 
 
-def require_same_size(frames: np.ndarray, reference: np.ndarray) -> None:
+def require_same_size(frames: Shaped[np.ndarray, "*any"], reference: Shaped[np.ndarray, "*any"]) -> None:
     """Refuse frames of another size or type than their reference frame."""
     require_rgb(frames)
     require_rgb(reference, what="levels of the reference")

@@ -6,8 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
-__all__ = ["FEWEST_UNITS", "Difference", "mean_interval", "paired_difference"]
-
 FEWEST_UNITS = 5
 """Fewer trials say little."""
 

@@ -17,11 +17,6 @@ from jaxtyping import Float
 
 from sliplens.errors import ContactError
 
-__all__ = [
-    "contact_radius", "hertz_displacement", "indentation", "normal_slope", "partial_slip_displacement",
-    "reduced_modulus", "safety_margin", "shear_displacement", "stick_radius", "stick_ratio",
-]  # fmt: skip
-
 Array: TypeAlias = Float[np.ndarray, "..."]
 Numbers: TypeAlias = float | Array
 SpatialField: TypeAlias = tuple[Array, Array, Array]

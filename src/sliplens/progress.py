@@ -213,9 +213,3 @@ class _Counter:
 
 def ignore(_done: int, _total: int) -> None:
     """Show nothing."""
-
-
-__all__ = [
-    "OnProgress", "Stages", "add_note", "counting", "current_listener", "current_reporter", "fold_equal", "number_of",
-    "open_stage", "report_each", "report_file", "report_progress", "reporting",
-]  # fmt: skip

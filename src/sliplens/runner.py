@@ -430,6 +430,3 @@ def keep_record(
             save_result(make(output.folder / "parts"), output.folder)
             remove(output.folder / "parts")  # not before: what fails above goes on from them
     report_file(folder, what, kept=output.complete)
-
-
-__all__ = ["Part", "Work", "keep_record", "part", "run_parts", "run_table"]

@@ -232,8 +232,3 @@ def _fill(moved: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "rows
             stray = ~(np.linalg.norm(moved - median, axis=-1) <= _STRAY * _STEP) & np.isfinite(median[..., 0])
         moved = np.where(stray[..., None], median, moved)
     return np.nan_to_num(moved)
-
-
-__all__ = [
-    "DIRECTION_LIMIT", "FULL_CIRCLE", "TOLERANCE_DEG", "Shear", "ShearEstimator", "enclosing_range", "range_words",
-]  # fmt: skip

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict, Unpack
 import msgspec
 
 from sliplens.cli import data  # noqa: F401 (its commands are listed first)
-from sliplens.cli.app import COMMANDS, command
+from sliplens.cli.app import command
 from sliplens.cli.console import OUT, Terminal, print_file, print_table, say
 from sliplens.errors import InputError, SliplensError
 from sliplens.files import require_new_file, to_builtins
@@ -464,6 +464,3 @@ def print_written(written: "Written") -> None:
 
 
 command("report", "report.page:write_report", "sliplens report runs/mine")(lambda call: print_written(call()))
-
-
-__all__ = ["COMMANDS"]

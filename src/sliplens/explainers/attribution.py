@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Tensor
 from torch.nn import functional
 
@@ -140,7 +140,7 @@ def local_change(
     return functional.avg_pool2d(padded, 2 * reach + 1, stride=1)[0, 0]
 
 
-def lacks_float64(values: Tensor) -> bool:
+def lacks_float64(values: Shaped[Tensor, "*any"]) -> bool:
     """Return True for values on a device without float64, Apple's MPS."""
     return values.device.type == "mps"
 

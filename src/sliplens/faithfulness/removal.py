@@ -85,7 +85,9 @@ def _answer(engine: Engine, batches: Iterable[Tensor]) -> Float64[np.ndarray, " 
     return np.concatenate([np.empty(0), *(margins.cpu().double().numpy() for margins in engine.run(batches))])
 
 
-def answer_whole(predict: Predict, images: Tensor) -> Float64[np.ndarray, " images"]:
+def answer_whole(
+    predict: Predict, images: Float[Tensor, "images colours height width"]
+) -> Float64[np.ndarray, " images"]:
     """Predict whole images."""
     engine = _as_engine(predict)
     return _answer(engine, images.split(engine.batch_size))

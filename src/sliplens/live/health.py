@@ -187,7 +187,7 @@ class HealthMonitor:
 
 
 def make_check(name: str, value: float, sentence: str | None = None, *, cure: str | None = None) -> Check:
-    """Compare a value with its limit in `CHECKS`; a check that fails states its cure."""
+    """Compare a value with its limit in `CHECKS`, in the unit of both; a check that fails states its cure."""
     kind = CHECKS[name]
     ok = value >= kind.limit if kind.is_minimum else value <= kind.limit
     sentence = kind.sentence.format(value) if sentence is None else sentence
@@ -372,6 +372,3 @@ def _saturated_share(image: Frame) -> float:
     red, green, blue = (image[::4, ::4, channel] for channel in range(3))
     white = np.minimum(np.minimum(red, green), blue) >= _WHITE
     return float(np.mean(white | (np.maximum(np.maximum(red, green), blue) <= _BLACK)))
-
-
-__all__ = ["CHECKS", "CheckKind", "HealthMonitor", "margin_risk", "severity"]

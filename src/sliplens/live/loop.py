@@ -689,6 +689,3 @@ def read_live(
 
 def _in_pixels(size: tuple[int, ...]) -> str:
     return f"{size[0]} x {size[1]}"
-
-
-__all__ = ["LiveReader", "ReaderSettings", "Subscriber", "read_live"]

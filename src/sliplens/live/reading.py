@@ -265,9 +265,3 @@ def _zone(low: float, high: float) -> Zone:
     if high > most:
         return Zone.ABOVE if low >= most else Zone.NOT_BELOW
     return Zone.WITHIN
-
-
-__all__ = [
-    "Check", "Latency", "LiveFrame", "MarkerReading", "Reading", "ReadingWords", "SlipState", "Zone",
-    "describe_reading",
-]  # fmt: skip

@@ -358,9 +358,3 @@ class Sender(Outlet[tuple[Reading, Frame | None]]):
         """Take a reading and its frame, without waiting."""
         image = None if frame is None else frame.image
         self.put((reading, image), size_bytes=_READING_BYTES + (0 if image is None else image.nbytes))
-
-
-__all__ = [
-    "IMAGE_TOPIC", "READING_TOPIC", "ROS_TOPICS", "SINKS", "RerunSink", "Sender", "Sink",
-    "ZenohRos", "encode_reading", "parse_zenoh", "reading_schema",
-]  # fmt: skip

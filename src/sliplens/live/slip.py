@@ -429,6 +429,3 @@ def _without(fields: Fields, *ways: Fields) -> Fields:
     for way in ways:
         fields = fields - np.einsum("rkm,rkm->r", fields, way)[:, None, None] * way
     return fields
-
-
-__all__ = ["HOLD_FALL", "SLIP_FALL", "ContactStates", "SlipBatch", "SlipDetector"]

@@ -175,7 +175,7 @@ class Explanation(OfOutput):
 
 
 def full_colour(relevance: Float[np.ndarray, "*any"]) -> float:
-    """Size of signed values that gets the full colour; 1 where all are zero."""
+    """Size of signed values that gets the full colour, in the unit of the values; 1 where all are zero."""
     sizes = np.abs(relevance)
     # a few outlying pixels would leave the rest of the map black
     return float(np.percentile(sizes, 99.5)) or float(sizes.max()) or 1.0
@@ -206,7 +206,7 @@ def full_points(relevance: Float[np.ndarray, "frames height width"], *, scale: f
 def overlay_points(
     pictures: Iterable[FrameU8], relevance: Float[np.ndarray, "frames height width"], *, scale: float = 1.0
 ) -> list[FrameU8]:
-    """Overlay pictures with signed maps on one scale (`full_points`)."""
+    """Overlay pictures with signed maps on one scale, in points of margin (`full_points`)."""
     limit = full_points(relevance, scale=scale)
     return [
         overlay_relevance(picture, values * values.size / limit)
@@ -222,7 +222,7 @@ def write_overlays(
     *,
     scale: float,
 ) -> list[FrameU8]:
-    """Write an overlay of every map into a folder, whole or not at all, and return them."""
+    """Write an overlay of every map (`overlay_points`, in points of margin) into a folder, each whole or not at all."""
     overlays, part = overlay_points(pictures, relevance, scale=scale), folder / f".{os.getpid()}"
     folder.mkdir(parents=True, exist_ok=True)
     for name, overlay in zip(names, overlays, strict=True):
@@ -281,7 +281,7 @@ class StripReadings(Columns):
     """True and predicted safety margin of every frame of a trial; NaN where the sensor touches nothing."""
 
     time_s: Annotated[Float64[np.ndarray, " frames"], TIME]
-    contact_state: np.ndarray
+    contact_state: Shaped[np.ndarray, " frames"]
     safety_margin: Annotated[Float64[np.ndarray, " frames"], MARGIN, UNKNOWN]
     """Margin of the label."""
     prediction: Annotated[Float64[np.ndarray, " frames"], ANSWER, UNKNOWN]

@@ -142,7 +142,7 @@ class MapMeasures:
     infidelity: Annotated[float, ANSWER] | None = None
     """Error of the changes that maps of a few frames predict, in margin units (`controls.infidelity`)."""
     max_sensitivity: float | None = None
-    """Largest relative change of the same maps under small noise (`controls.max_sensitivity`)."""
+    """Largest change of the same maps under small noise, as a ratio (`controls.max_sensitivity`)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -170,7 +170,7 @@ def marker_sums(
 
 
 def study_explainers(methods: Sequence[str], *, budget: float = records.STUDY_BUDGET) -> dict[str, Explainer]:
-    """Explainers of a study: rows of `EXPLAINERS`, Poly-CAM with some of the channels measured at first."""
+    """Explainers of a study: rows of `EXPLAINERS`, Poly-CAM with a share of the channels measured at first."""
     rows: dict[str, Explainer] = {
         "poly-cam": get_explainer("poly-cam", budget=budget),
         # compared with what was published; its weights are nearly all 1, so that this costs little

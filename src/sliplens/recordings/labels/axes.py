@@ -50,7 +50,7 @@ def typical_step(time_s: Samples) -> float:
 
 
 def longest_step(time_s: Samples) -> float:
-    """Return the time between two samples beyond which samples are missing."""
+    """Return the time in seconds between two samples beyond which samples are missing."""
     return _GAP_STEPS * typical_step(time_s)
 
 
