@@ -20,7 +20,7 @@ from torch.nn import functional
 
 import sliplens as sl
 from sliplens.cli.console import Terminal
-from sliplens.codec import write_json
+from sliplens.files import write_json
 from sliplens.intervals import Difference, mean_interval, paired_difference
 from sliplens.plots.style import UNKNOWN, input_name, inputs_in_order, method_name
 from sliplens.recordings import Dataset

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from sliplens.codec import save_result, write_json
+from sliplens.codec import save_result
 from sliplens.faithfulness.scoring import score_deletion
-from sliplens.files import Provenance, machine, versions
+from sliplens.files import Provenance, machine, versions, write_json
 from sliplens.recordings import TrialInfo
 from sliplens.recordings.dataset import write_dataset_table
 from sliplens.results.evaluation import Evaluation, LearningCurve, ScoredFrames, Training

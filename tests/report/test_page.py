@@ -12,8 +12,8 @@ import pyarrow.parquet as pq
 import pytest
 from command_line import run
 
-from sliplens.codec import write_json
 from sliplens.errors import InputError
+from sliplens.files import write_json
 from sliplens.report import Written, load_results, write_report
 from sliplens.report.plates import frames_by_margin
 from sliplens.results.study import CONFIG_FILE, StudyConfig

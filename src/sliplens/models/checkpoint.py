@@ -16,10 +16,18 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
-from sliplens.codec import load_record, load_result, write_json
+from sliplens.codec import load_record, load_result
 from sliplens.errors import CheckpointError, ImageError, InputError
 from sliplens.extras import pick, require_device
-from sliplens.files import DIFFERENCE_NETWORK, MANIFEST_FILE, find_run, hash_file, require_folder, whole_file
+from sliplens.files import (
+    DIFFERENCE_NETWORK,
+    MANIFEST_FILE,
+    find_run,
+    hash_file,
+    require_folder,
+    whole_file,
+    write_json,
+)
 from sliplens.friction import LEARNT, Friction, FrictionLike, as_friction
 from sliplens.images import channel_correlations, has_colour, require_rgb
 from sliplens.models.backbones import (

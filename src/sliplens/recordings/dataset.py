@@ -13,9 +13,18 @@ import numpy as np
 import pyarrow as pa
 from filelock import FileLock, Timeout
 
-from sliplens.codec import Result, from_builtins, one_line, to_builtins
+from sliplens.codec import Result, from_builtins, one_line
 from sliplens.errors import InputError, RecordingError, SliplensError
-from sliplens.files import hash_file, hash_json, parse_json, read_json, require_file, require_folder, write_json
+from sliplens.files import (
+    hash_file,
+    hash_json,
+    parse_json,
+    read_json,
+    require_file,
+    require_folder,
+    to_builtins,
+    write_json,
+)
 from sliplens.images import encode_image, read_image
 from sliplens.progress import OnProgress, add_note, fold_equal, number_of, report_file, reporting
 from sliplens.recordings import store

@@ -18,9 +18,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Float, UInt8
 
-from sliplens.codec import from_builtins, open_parquet, read_parquet, to_builtins, write_tables
+from sliplens.codec import from_builtins, open_parquet, read_parquet, write_tables
 from sliplens.errors import RecordingError
-from sliplens.files import hash_json, parse_json, whole_file
+from sliplens.files import hash_json, parse_json, to_builtins, whole_file
 from sliplens.images import MOST_PIXELS, encode_image, read_image
 from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.labelling import Labelling

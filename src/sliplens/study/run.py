@@ -13,14 +13,14 @@ from typing import Any, TypeAlias
 import torch
 from torch import Tensor, nn
 
-from sliplens.codec import load_result, write_json
+from sliplens.codec import load_result
 from sliplens.errors import InputError
 from sliplens.explainers.contract import Explainer
 from sliplens.explainers.explain import network_inputs, with_markers
 from sliplens.explainers.frames import frames_at
 from sliplens.explainers.table import RECOMMENDED_METHOD
 from sliplens.faithfulness.scoring import influences
-from sliplens.files import DEFAULT_NETWORK, hash_json, scratch_folder
+from sliplens.files import DEFAULT_NETWORK, hash_json, scratch_folder, write_json
 from sliplens.intervals import FEWEST_UNITS
 from sliplens.models import Network
 from sliplens.models.wrapping import open_run
