@@ -27,8 +27,7 @@ from simulated_data import simulate_recipe
 
 import sliplens
 from house import sentences
-from sliplens.cli.app import adapt
-from sliplens.cli.commands import COMMANDS
+from sliplens.cli.app import COMMANDS, adapt
 from sliplens.images import write_png
 from sliplens.live import LiveReader
 from sliplens.simulation import Nuisances, SimulationRecipe, plan_trials, simulate_trial

@@ -26,8 +26,8 @@ def read(one: int, told: dict[str, Any], **more: object) -> int:
 def _read() -> dict[str, object]: ...
 '''
 ALLOWED = {
-    "lines": 34_304,
-    "modules": 141,
+    "lines": 33_996,
+    "modules": 140,
     "riddles_per_1000": 0.18,
     "vague_docstrings": 0,
     "most_parameters": 12,

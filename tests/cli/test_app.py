@@ -11,8 +11,7 @@ import pytest
 from command_line import refused, run
 
 import sliplens
-from sliplens.cli.app import adapt
-from sliplens.cli.commands import COMMANDS
+from sliplens.cli.app import COMMANDS, adapt
 
 NAMED = pytest.mark.parametrize("name", COMMANDS)
 

@@ -9,8 +9,8 @@ from difflib import get_close_matches
 
 import cyclopts
 
-from sliplens.cli.app import adapt, name_options
-from sliplens.cli.commands import COMMANDS
+from sliplens.cli import commands  # noqa: F401 (they are listed when they are imported)
+from sliplens.cli.app import COMMANDS, adapt, name_options
 from sliplens.cli.console import OUT, fail, say
 from sliplens.errors import InputError, PartError, SliplensError
 from sliplens.files import versions
