@@ -349,7 +349,7 @@ def as_frames(images: Images, *, what: str = "frames") -> UInt8[np.ndarray, "fra
     return images
 
 
-def require_same_size(frames: Shaped[np.ndarray, "*any"], reference: Shaped[np.ndarray, "*any"]) -> None:
+def require_same_size(frames: Shaped[np.ndarray, "..."], reference: Shaped[np.ndarray, "..."]) -> None:
     """Refuse frames of another size or type than their reference frame."""
     require_rgb(frames)
     require_rgb(reference, what="levels of the reference")
