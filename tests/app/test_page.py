@@ -64,7 +64,7 @@ def seen(browser, page: LivePage):
     window.context.close()
 
 
-def wait_until(window, condition: str, *, within_s: float = 60.0) -> None:
+def wait_until(window, condition: str, *, within_s: float = 240.0) -> None:
     """Wait until something is so; Playwright's own way runs text as code, which the page forbids."""
     end_s = time.monotonic() + within_s
     while not window.evaluate(condition):
